@@ -1,0 +1,1 @@
+"""can-bridge: serial CAN adapters as Linux CAN interfaces."""

@@ -1,0 +1,7 @@
+"""python -m bridged is can-bridge."""
+
+import sys
+
+from bridged.cli import main
+
+sys.exit(main())

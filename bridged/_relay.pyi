@@ -1,0 +1,79 @@
+"""The data plane in C (bridged/relay): one Relay moves the frames of one bridge."""
+
+from typing import Final, Protocol
+
+class _HasFileno(Protocol):
+    def fileno(self) -> int: ...
+
+GATE_AWAY: Final[int]  # frames from the bus are dropped: no adapter
+GATE_OPEN: Final[int]  # frames from the bus are sent
+GATE_LISTEN_ONLY: Final[int]  # dropped: the channel does not send
+GATE_STOPPED: Final[int]  # dropped: the bridge is stopping
+ACCEPT_OK: Final[int]
+ACCEPT_REFUSED: Final[int]
+EVENT_OK: Final[int]
+EVENT_REFUSED: Final[int]
+EVENT_TEXT: Final[int]
+EVENT_TIMEOUT: Final[int]
+EVENT_UNASKED: Final[int]
+EVENT_FRAME_REFUSED: Final[int]
+EVENT_UNANSWERED: Final[int]
+EVENT_SILENT: Final[int]
+EVENT_STAMPED: Final[int]
+EVENT_PORT_LOST: Final[int]
+EVENT_BUS_DOWN: Final[int]
+EVENT_BUS_LOST: Final[int]
+WINDOW_MAX: Final[int]
+
+class Relay:
+    """Relays frames between a port (bytes) and a bus (datagrams of struct can_frame).
+
+    Times are seconds. `window`: how many commands may be unanswered. `deadline`: a frame older than
+    this is not sent. `sync`: a command whose answer, a text that begins with `sync_prefix`, cannot be
+    taken for any other answer; sent to find the thread again after an answer was lost.
+    Descriptors stay the caller's to close, after they were detached.
+    Raises ValueError for settings out of range, OSError when descriptors or memory run out.
+    """
+
+    def __new__(
+        cls,
+        codec: str,
+        *,
+        queue: int,
+        window: int,
+        deadline: float,
+        answer_timeout: float,
+        sync: bytes,
+        sync_prefix: str,
+    ) -> Relay: ...
+    def run(self) -> None:
+        """Relay until stop() is called, without the GIL. OSError(EBUSY): another thread does."""
+    def turn(self, now: int, /) -> int | None:
+        """One turn without waiting at the time `now` (ns); the time of the next one, None: on input."""
+    def stop(self) -> None: ...
+    def fileno(self) -> int:
+        """Readable when events() has something."""
+    def attach_port(self, fd: int | _HasFileno, /) -> None:
+        """Talk to this non-blocking stream. Gates are closed: only commands go, frames are dropped."""
+    def detach_port(self) -> None: ...
+    def attach_bus(self, fd: int | _HasFileno, /) -> None: ...
+    def detach_bus(self) -> None: ...
+    def set_gates(self, *, receiving: bool, transmit: int) -> None:
+        """Whether frames from the device go to the bus, and what happens to those from the bus."""
+    def set_polling(self, request: bytes, prefix: str, interval: float, /) -> None:
+        """Ask the device for frames with `request` until the port is detached."""
+    def command(self, token: int, data: bytes, accept: int, prefix: str, timeout: float) -> None:
+        """Send a command at the next message boundary; an event with `token` always follows."""
+    def events(self) -> list[tuple[int, int, bytes]]:
+        """What happened since the last call: (EVENT_…, token, text)."""
+    def counters(self) -> dict[str, int | dict[str, int]]:
+        """A snapshot between two turns: bus_read = tx_frames + queued + the sum of tx_dropped."""
+
+def decode(codec: str, pieces: list[bytes], /) -> list[tuple[str, bytes, int]]:
+    """The messages of a stream that arrives in these pieces: (kind, frame or text, digits or length)."""
+
+def encode(codec: str, frame: bytes, /) -> bytes:
+    """The bytes for one struct can_frame; empty if the protocol cannot say it."""
+
+def clock() -> int:
+    """The relay's clock, ns: CLOCK_BOOTTIME."""

@@ -1,0 +1,90 @@
+"""What an adapter is: values that say what to send, what answers it, and what that means. No I/O."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Reply(enum.Enum):
+    """How a device can answer."""
+
+    OK = enum.auto()
+    REFUSED = enum.auto()
+    TEXT = enum.auto()  # a line that begins with Exchange.text
+    NONE = enum.auto()  # nothing, until Exchange.timeout_s
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """One request and the answers it can have. An answer in neither tuple is somebody else's."""
+
+    request: bytes
+    purpose: str  # completes "the adapter refused to …", "the adapter did not answer the request to …"
+    accept: tuple[Reply, ...]
+    reject: tuple[Reply, ...] = (Reply.REFUSED, Reply.NONE)
+    text: str = ""  # first character of the text that answers
+    advice: str = ""  # what the user can do when it is rejected
+    timeout_s: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came back for an exchange."""
+
+    reply: Reply
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Polling:
+    """A device that does not speak by itself is asked for frames this often."""
+
+    request: bytes
+    text: str
+    interval_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who the device says it is."""
+
+    version: str | None = None
+    serial_number: str | None = None
+
+
+class Memory(Protocol):
+    """What is known of a device's settings that it cannot be asked for, by serial number."""
+
+    def recall(self, serial_number: str, setting: str) -> int | None: ...
+    def remember(self, serial_number: str, setting: str, value: int) -> None: ...
+
+
+Steps = Generator[Exchange, Answer, None]
+
+
+class Adapter(Protocol):
+    """One kind of device. bridge.py performs the steps, in order, each with its deadline."""
+
+    codec: str
+    sync: Exchange  # its answer cannot be taken for any other
+    answer_timeout_s: float  # for the answer to a frame
+    identity: Identity
+    polling: Polling | None  # known after init_steps
+
+    def init_steps(self) -> Steps:
+        """From whatever state to an open channel. Raises AdapterError for a device that will not do."""
+
+    def close_steps(self) -> Steps:
+        """From whatever state to a closed channel; the steps accept every answer."""
+
+    def status_request(self) -> Exchange:
+        """Asks what the device thinks of itself; describe_status explains the answer."""
+
+    def describe_status(self, answer: Answer) -> str:
+        """The status in words, for a log line."""
+
+    def saw_time_stamps(self) -> None:
+        """Frames with time stamps came, which nobody asked for."""

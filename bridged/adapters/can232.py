@@ -1,0 +1,202 @@
+"""LAWICEL CAN232 and devices that speak its ASCII protocol (CAN232 manual, version 3)."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Generator
+from typing import TYPE_CHECKING
+
+from bridged.adapters.base import Answer, Exchange, Identity, Memory, Polling, Reply, Steps
+from bridged.errors import AdapterError, WrongDeviceError
+
+if TYPE_CHECKING:
+    from bridged.config import AdapterConfig, ChannelConfig
+
+log = logging.getLogger(__name__)
+
+OK, REFUSED, TEXT, NONE = Reply.OK, Reply.REFUSED, Reply.TEXT, Reply.NONE
+ANYTHING = (OK, REFUSED, TEXT, NONE)
+
+LONGEST_LINE = 27  # "T1FFFFFFF81122334455667788\r"
+RECEIVE_FIFO = 32  # frames that may be on their way out before an answer (manual 1.3)
+AUTO_POLL_SINCE = "1220"  # hhss of the first firmware with X (manual 2.0, P and A)
+POLL_INTERVAL_S = 0.01
+
+# A command that a crashed program left half typed is in the device's buffer. A CR would finish it: a
+# frame from another time goes out on a live bus. A "C" might even complete it, being a hex digit. "V"
+# is no hex digit, makes every half command invalid, and alone only asks for the version; there are
+# more of them than the longest command has characters, for firmware that cuts lines instead.
+FLUSH = b"V" * (LONGEST_LINE + 3) + b"\r"
+
+# F, CAN232 manual: bit -> meaning. Bit 4 is not used.
+STATUS_FLAGS = {
+    0: "receive FIFO full",
+    1: "transmit FIFO full",
+    2: "error warning",
+    3: "data overrun",
+    5: "error passive",
+    6: "arbitration lost",
+    7: "bus error",
+}
+
+
+class Can232:
+    """Sans-I/O: what to say to a CAN232. `identity` and `polling` hold what init_steps found out."""
+
+    codec = "can232"
+
+    def __init__(self, adapter: AdapterConfig, channel: ChannelConfig, memory: Memory) -> None:
+        self._port = adapter.port
+        self._baudrate = adapter.baudrate
+        self._wanted_serial = adapter.serial_number
+        self._channel = channel
+        self._memory = memory
+        self._stamped = False
+        self.identity = Identity()
+        self.polling: Polling | None = None
+        # An answer may stand behind a full receive FIFO on the line: 10 bit times a character.
+        self.answer_timeout_s = 0.2 + RECEIVE_FIFO * LONGEST_LINE * 10 / adapter.baudrate
+        self.sync = self._step(b"V\r", "tell its version", (TEXT,), (NONE,), text="V")
+
+    def _step(
+        self,
+        request: bytes,
+        purpose: str,
+        accept: tuple[Reply, ...] = (OK,),
+        reject: tuple[Reply, ...] = (REFUSED, NONE),
+        *,
+        text: str = "",
+        advice: str = "",
+    ) -> Exchange:
+        return Exchange(request, purpose, accept, reject, text, advice, self.answer_timeout_s)
+
+    # --- start and end ------------------------------------------------------------------------
+
+    def init_steps(self) -> Steps:
+        """Flush, close, identify, configure, open (manual 1.4), then see that it polls by itself."""
+        self.polling = None
+        yield from self._flush()
+        yield from self._identify()
+        yield from self._configure()
+        yield from self._open()
+        if (yield from self._auto_poll()):
+            return
+        if (self.identity.version or "")[1:] >= AUTO_POLL_SINCE:
+            yield from self._close()
+            switched = yield self._step(b"X1\r", "send frames by itself", (OK, REFUSED), (NONE,))
+            yield from self._open()
+            if switched.reply is OK:
+                log.info("adapter's auto poll was off: X1 written to its EEPROM")
+                return
+        log.info("firmware without auto poll: asking for frames with A")
+        self.polling = Polling(b"A\r", "A", POLL_INTERVAL_S)
+
+    def close_steps(self) -> Steps:
+        """`C` until it is certain: the first may end a half command or meet an old answer."""
+        yield from self._close()
+        answer = yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
+        if answer.reply is NONE:
+            yield from self._close()
+
+    def _flush(self) -> Steps:
+        """Lone CRs, as the manual wants them, only once the channel is closed: on an open one some
+        clones answer them by sending their last frame again."""
+        yield self._step(FLUSH, "drop a half-typed command", ANYTHING, (), text="V")
+        yield from self._close()
+        yield self._step(b"\r\r", "empty its command buffer", ANYTHING, ())
+
+    def _close(self) -> Steps:
+        yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
+
+    def _identify(self) -> Steps:
+        for _ in range(3):
+            answer = yield self._step(b"V\r", "tell its version", (TEXT, NONE), (), text="V")
+            if answer.reply is TEXT:
+                break
+        else:
+            msg = (
+                f"no answer to V on {self._port} at {self._baudrate} Bd: is the adapter powered (from the CAN side, "
+                f"6-16 V), the baud rate right (its LEDs blink it at power-on), the cable plugged?"
+            )
+            raise AdapterError(msg)
+        if not re.fullmatch("V[0-9A-F]{4}", answer.text):
+            msg = f"the device on {self._port} answers V with {answer.text!r}: not a CAN232 (Vhhss)"
+            raise WrongDeviceError(msg)
+        version = answer.text
+        answer = yield self._step(b"N\r", "tell its serial number", (TEXT, REFUSED, NONE), (), text="N")
+        serial = answer.text[1:] if answer.reply is TEXT else None
+        self.identity = Identity(version, serial)
+        if self._wanted_serial is not None and serial != self._wanted_serial:
+            msg = (
+                f"the adapter on {self._port} has serial number {serial or 'unknown'}, "
+                f"adapter.serial_number wants {self._wanted_serial}"
+            )
+            raise WrongDeviceError(msg)
+
+    # --- settings -----------------------------------------------------------------------------
+
+    def _configure(self) -> Steps:
+        timing = self._channel.timing
+        bitrate = timing.can232_command()
+        yield self._step(
+            bitrate,
+            f"set the bit rate ({bitrate[:-1].decode()}, {timing.description})",
+            advice="this firmware may not have it: give btr0 and btr1",
+        )
+        if self._stamped or self._recall("Z") == 1:
+            yield from self._write_eeprom("Z", 0, "send frames without time stamps")
+            self._stamped = False
+        acceptance = self._channel.acceptance
+        if acceptance is not None:
+            yield from self._write_eeprom("W", int(acceptance.single), f"use {acceptance.mode} filter mode")
+        # Always, also to pass all: the device keeps what the program before us set until power-off.
+        code, mask = (acceptance.code, acceptance.mask) if acceptance else (0, 0xFFFFFFFF)
+        yield self._step(f"M{code:08X}\r".encode(), f"set the acceptance code {code:#010x}")
+        yield self._step(f"m{mask:08X}\r".encode(), f"set the acceptance mask {mask:#010x}")
+
+    def _recall(self, setting: str) -> int | None:
+        serial = self.identity.serial_number
+        return None if serial is None else self._memory.recall(serial, setting)
+
+    def _write_eeprom(self, setting: str, value: int, purpose: str) -> Steps:
+        """EEPROM cells wear out and cannot be read: write only what is not known to be there."""
+        if self._recall(setting) == value:
+            return
+        yield self._step(f"{setting}{value}\r".encode(), f"{purpose} ({setting}{value})")
+        log.info("wrote %s%d to the adapter's EEPROM", setting, value)
+        if self.identity.serial_number is not None:
+            self._memory.remember(self.identity.serial_number, setting, value)
+
+    def _open(self) -> Steps:
+        if self._channel.listen_only:
+            yield self._step(b"L\r", "open the channel in listen-only mode (L)")
+        else:
+            yield self._step(b"O\r", "open the channel (O)")
+
+    def _auto_poll(self) -> Generator[Exchange, Answer, bool]:
+        """Whether frames come by themselves: then A is refused (manual 2.0, A). X cannot be read."""
+        answer = yield self._step(b"A\r", "tell whether it polls", (TEXT, REFUSED, NONE), (), text="A")
+        return answer.reply is not TEXT
+
+    # --- health -------------------------------------------------------------------------------
+
+    def status_request(self) -> Exchange:
+        """`F`; reading clears the flags: they say what happened since the last time."""
+        return self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), text="F")
+
+    def describe_status(self, answer: Answer) -> str:
+        if answer.reply is REFUSED:
+            return "channel closed"
+        if not re.fullmatch("F[0-9A-Fa-f]{2}", answer.text):
+            return "unknown"
+        flags = int(answer.text[1:], 16)
+        return ", ".join(text for bit, text in STATUS_FLAGS.items() if flags >> bit & 1) or "no flags"
+
+    def saw_time_stamps(self) -> None:
+        if self._stamped:
+            return
+        self._stamped = True
+        if self.identity.serial_number is not None:
+            self._memory.remember(self.identity.serial_number, "Z", 1)
+        log.warning("adapter sends time stamps (Z1), a sixth of its line; switched off at the next start")

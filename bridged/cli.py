@@ -1,0 +1,159 @@
+"""The command can-bridge."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bridged.errors import BridgeError, ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bridged.config import Config
+
+EX_CONFIG = 78  # sysexits.h
+EXIT_NOT_RUNNING = 3  # as systemctl status
+CONFIG_DIRECTORY = Path("/etc/can-bridge")
+
+
+def config_path(name: str) -> Path:
+    """A file, or the NAME of one in /etc/can-bridge."""
+    path = Path(name)
+    if "/" in name or path.suffix in {".yaml", ".yml"} or path.is_file():
+        return path
+    return CONFIG_DIRECTORY / f"{name}.yaml"
+
+
+def _load(name: str) -> Config:
+    from bridged.config import load  # noqa: PLC0415 - 20 ms that `status` need not pay
+
+    return load(config_path(name))
+
+
+def _run(args: argparse.Namespace) -> int:
+    from bridged.bridge import Bridge  # noqa: PLC0415
+    from bridged.memory import FileMemory, state_directory  # noqa: PLC0415
+    from bridged.service import serve  # noqa: PLC0415
+    from bridged.status import StatusServer, render, socket_path  # noqa: PLC0415
+
+    config = _load(args.config)
+    _log_to_stderr(config.name, verbose=args.verbose)
+    bridge = Bridge(config, FileMemory(state_directory()))
+    status = StatusServer(args.socket or socket_path(config.name), bridge.snapshot)
+    try:
+        serve(bridge, status)
+    finally:
+        status.close()
+    logging.getLogger(__name__).info("%s", render(bridge.snapshot()).replace("\n ", ";"))
+    return 0
+
+
+def _log_to_stderr(name: str, *, verbose: bool) -> None:
+    logging.basicConfig(
+        format=f"%(asctime)s %(levelname)-7s {name}: %(message)s",
+        level=logging.DEBUG if verbose else logging.INFO,
+    )
+
+
+def _check(args: argparse.Namespace) -> int:
+    config = _load(args.config)
+    adapter, channel, bus = config.adapter, config.channel, config.bus
+    print(
+        f"{config.path}: good: {adapter.type} on {adapter.port} at {adapter.baudrate} Bd, "
+        f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
+        f"to {bus.interface} {bus.channel}"
+    )
+    return 0
+
+
+def _status_path(args: argparse.Namespace) -> Path:
+    from bridged.status import StatusError, runtime_directory, socket_path  # noqa: PLC0415
+
+    if args.socket:
+        return Path(args.socket)
+    if args.name:
+        return socket_path(Path(args.name).stem)
+    running = sorted(runtime_directory().glob("*.sock"))
+    if len(running) == 1:
+        return running[0]
+    names = ", ".join(path.stem for path in running)
+    raise StatusError(f"several bridges are running, name one: {names}" if running else "no bridge is running")
+
+
+def _status(args: argparse.Namespace) -> int:
+    from bridged.status import query, render  # noqa: PLC0415
+
+    status = query(_status_path(args))
+    print(json.dumps(status, indent=2) if args.json else render(status))
+    return 0 if status["state"] == "running" else EXIT_NOT_RUNNING
+
+
+def _parser(command: str | None) -> argparse.ArgumentParser:
+    """The parser; only `command` gets its options, since those of a simulator cost its import."""
+    parser = argparse.ArgumentParser("can-bridge", description="Serial CAN adapters as Linux CAN interfaces.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, text: str, run: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(run=run)
+        return sub
+
+    run = add("run", "Run the bridge of a configuration in the foreground.", _run)
+    run.add_argument("config", metavar="FILE|NAME", help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml")
+    run.add_argument("--socket", type=Path, metavar="PATH", help="where the status socket is made")
+    run.add_argument("--verbose", action="store_true", help="log what is only of interest when looking for a fault")
+
+    check = add("check", "Check a configuration; exit status 78 if it is not good.", _check)
+    check.add_argument("config", metavar="FILE|NAME")
+
+    status = add("status", "Show the state and the counters of a running bridge; exit status 0 if it runs.", _status)
+    status.add_argument("name", nargs="?", metavar="NAME", help="stem of the configuration's file name")
+    status.add_argument("--socket", metavar="PATH", help="the status socket, if not at its usual place")
+    status.add_argument("--json", action="store_true")
+
+    simulate = add("simulate", "Simulate an adapter on a pseudo terminal.", _simulate)
+    if command == "simulate":
+        from bridged.simulators import serve  # noqa: PLC0415
+
+        kinds = simulate.add_subparsers(dest="kind", required=True, metavar="ADAPTER")
+        serve.add_arguments(kinds.add_parser("can232", help="LAWICEL CAN232"))
+
+    demo = add("demo", "Show a simulated adapter at work on a CAN interface.", _demo)
+    if command == "demo":
+        from bridged.demo import add_arguments  # noqa: PLC0415
+
+        add_arguments(demo)
+    return parser
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from bridged.simulators import serve  # noqa: PLC0415
+
+    return serve.run(args)
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from bridged import demo  # noqa: PLC0415
+
+    return demo.run(args)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point. Exit status: 0 done, 1 failed, 3 the bridge is not running, 78 bad configuration."""
+    arguments = sys.argv[1:] if argv is None else argv
+    args = _parser(arguments[0] if arguments else None).parse_args(arguments)
+    try:
+        return int(args.run(args))
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return EX_CONFIG
+    except BridgeError as error:
+        print(f"can-bridge: {error}", file=sys.stderr)
+        return EXIT_NOT_RUNNING if args.command == "status" else 1
+    except BrokenPipeError:
+        return 1

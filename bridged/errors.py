@@ -1,0 +1,31 @@
+"""What can go wrong, by who can mend it. Any other exception is a bug."""
+
+from __future__ import annotations
+
+
+class BridgeError(Exception):
+    """Base of all errors that this package raises on purpose; the text says what to do."""
+
+
+class ConfigError(BridgeError):
+    """The configuration cannot be used: `problems` holds one line each, `FILE:LINE:COLUMN: path: text`."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+class PortError(BridgeError):
+    """The port could not be opened, or is gone: cable pulled, no permission, host not reachable."""
+
+
+class AdapterError(BridgeError):
+    """The device on the port did not do what its manual says: no answer, a refusal, the wrong device."""
+
+
+class WrongDeviceError(AdapterError):
+    """The device answers, but is not the one that the configuration means; trying again soon is no use."""
+
+
+class BusError(BridgeError):
+    """The CAN interface on the host's side could not be opened, made or used."""

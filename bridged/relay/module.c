@@ -1,0 +1,524 @@
+/* bridged._relay: the relay and the codecs for Python. The only file that includes Python.h. */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <errno.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "relay.h"
+
+static const char *const TX_DROP_NAMES[TX_DROPS] = {
+    "error-frame", "fd-frame", "malformed", "queue-full", "stale", "refused",
+    "overtaken", "unanswered", "adapter-away", "listen-only", "stopped"};
+static const char *const RX_DROP_NAMES[RX_DROPS] = {"not-running", "bus-queue-full", "bus-down", "bus-lost"};
+
+static const struct {
+    const char *name;
+    long value;
+} CONSTANTS[] = {
+    {"GATE_AWAY", GATE_AWAY},
+    {"GATE_OPEN", GATE_OPEN},
+    {"GATE_LISTEN_ONLY", GATE_LISTEN_ONLY},
+    {"GATE_STOPPED", GATE_STOPPED},
+    {"ACCEPT_OK", ACCEPT_OK},
+    {"ACCEPT_REFUSED", ACCEPT_REFUSED},
+    {"EVENT_OK", EVENT_OK},
+    {"EVENT_REFUSED", EVENT_REFUSED},
+    {"EVENT_TEXT", EVENT_TEXT},
+    {"EVENT_TIMEOUT", EVENT_TIMEOUT},
+    {"EVENT_UNASKED", EVENT_UNASKED},
+    {"EVENT_FRAME_REFUSED", EVENT_FRAME_REFUSED},
+    {"EVENT_UNANSWERED", EVENT_UNANSWERED},
+    {"EVENT_SILENT", EVENT_SILENT},
+    {"EVENT_STAMPED", EVENT_STAMPED},
+    {"EVENT_PORT_LOST", EVENT_PORT_LOST},
+    {"EVENT_BUS_DOWN", EVENT_BUS_DOWN},
+    {"EVENT_BUS_LOST", EVENT_BUS_LOST},
+    {"WINDOW_MAX", WINDOW_MAX},
+};
+
+typedef struct {
+    PyObject_HEAD
+    struct relay *relay;
+} RelayObject;
+
+static struct relay *self_relay(PyObject *self)
+{
+    return ((RelayObject *)self)->relay;
+}
+
+/* The loop thread holds the lock only for one turn, never waits with it and never needs the GIL. */
+static struct relay *relay_lock(PyObject *self)
+{
+    struct relay *r = self_relay(self);
+    pthread_mutex_lock(&r->lock);
+    return r;
+}
+
+static PyObject *relay_unlock(struct relay *r)
+{
+    pthread_mutex_unlock(&r->lock);
+    Py_RETURN_NONE;
+}
+
+/* After a change that the loop must see. */
+static PyObject *relay_unlock_wake(struct relay *r)
+{
+    pthread_mutex_unlock(&r->lock);
+    relay_wake(r);
+    Py_RETURN_NONE;
+}
+
+static const struct codec *codec_by_name(const char *name)
+{
+    static const struct codec *const codecs[] = {&codec_can232};
+    for (size_t i = 0; i < sizeof codecs / sizeof codecs[0]; i++)
+        if (strcmp(codecs[i]->name, name) == 0)
+            return codecs[i];
+    PyErr_Format(PyExc_ValueError, "no codec named '%s'", name);
+    return NULL;
+}
+
+static int64_t seconds_to_ns(double seconds)
+{
+    return (int64_t)(seconds * (double)NS_PER_S);
+}
+
+/* Fills a command; prefix is a text of at most one character. */
+static int command_init(struct command *c, const Py_buffer *data, int accept, const char *prefix)
+{
+    if (data->len < 1 || data->len > COMMAND_SIZE) {
+        PyErr_Format(PyExc_ValueError, "a command has 1 to %d bytes, not %zd", COMMAND_SIZE, data->len);
+        return -1;
+    }
+    *c = (struct command){.accept = (uint8_t)accept, .prefix = (uint8_t)prefix[0], .length = (uint8_t)data->len};
+    memcpy(c->data, data->buf, (size_t)data->len);
+    return 0;
+}
+
+static int settings_check(const struct settings *s, double deadline, double answer_timeout)
+{
+    if (s->queue < 1 || s->window < 1 || s->window > WINDOW_MAX) {
+        PyErr_Format(PyExc_ValueError, "queue is 1 or more, window 1 to %d", WINDOW_MAX);
+        return -1;
+    }
+    if (!(deadline > 0 && deadline < 1e6 && answer_timeout > 0 && answer_timeout < 1e6)) {
+        PyErr_SetString(PyExc_ValueError, "deadline and answer_timeout are seconds, more than 0");
+        return -1;
+    }
+    return 0;
+}
+
+static PyObject *Relay_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"codec", "queue", "window", "deadline", "answer_timeout", "sync", "sync_prefix", NULL};
+    struct settings set = {0};
+    const char *codec, *prefix;
+    double deadline, answer_timeout;
+    Py_buffer sync;
+    RelayObject *self = NULL;
+
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$IIddy*s:Relay", names, &codec, &set.queue, &set.window,
+                                     &deadline, &answer_timeout, &sync, &prefix))
+        return NULL;
+    set.codec = codec_by_name(codec);
+    if (!set.codec || settings_check(&set, deadline, answer_timeout) < 0
+        || command_init(&set.sync, &sync, 0, prefix) < 0)
+        goto done;
+    set.deadline_ns = seconds_to_ns(deadline);
+    set.answer_timeout_ns = seconds_to_ns(answer_timeout);
+    allocfunc alloc = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
+    self = (RelayObject *)alloc(type, 0);
+    if (self && !(self->relay = relay_new(&set))) {
+        PyErr_SetFromErrno(PyExc_OSError);
+        Py_CLEAR(self);
+    }
+done:
+    PyBuffer_Release(&sync);
+    return (PyObject *)self;
+}
+
+static void Relay_dealloc(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    freefunc release = (freefunc)PyType_GetSlot(type, Py_tp_free);
+    if (self_relay(self))
+        relay_free(self_relay(self));
+    release(self);
+    Py_DECREF(type);
+}
+
+static PyObject *Relay_run(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    int error;
+    Py_BEGIN_ALLOW_THREADS
+    error = relay_run(self_relay(self));
+    Py_END_ALLOW_THREADS
+    if (error) {
+        errno = error;
+        return PyErr_SetFromErrno(PyExc_OSError);
+    }
+    Py_RETURN_NONE;
+}
+
+static PyObject *Relay_turn(PyObject *self, PyObject *arg)
+{
+    int64_t now = PyLong_AsLongLong(arg);
+    if (now == -1 && PyErr_Occurred())
+        return NULL;
+    struct relay *r = relay_lock(self);
+    int64_t next = relay_turn(r, now);
+    pthread_mutex_unlock(&r->lock);
+    if (next == NEVER)
+        Py_RETURN_NONE;
+    return PyLong_FromLongLong(next);
+}
+
+static PyObject *Relay_stop(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    r->stop = true;
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_fileno(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    return PyLong_FromLong(self_relay(self)->event_fd);
+}
+
+static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
+{
+    int fd = PyObject_AsFileDescriptor(arg);
+    if (fd < 0)
+        return NULL;
+    struct relay *r = relay_lock(self);
+    relay_attach_port(r, fd);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_detach_port(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    relay_detach_port(r);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
+{
+    int fd = PyObject_AsFileDescriptor(arg);
+    if (fd < 0)
+        return NULL;
+    struct relay *r = relay_lock(self);
+    relay_attach_bus(r, fd);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_detach_bus(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    relay_attach_bus(r, -1);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"receiving", "transmit", NULL};
+    int receiving, gate;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "$pi:set_gates", names, &receiving, &gate))
+        return NULL;
+    if (gate < 0 || gate >= GATES) {
+        PyErr_SetString(PyExc_ValueError, "transmit is one of the GATE_ constants");
+        return NULL;
+    }
+    struct relay *r = relay_lock(self);
+    r->receiving = receiving;
+    transmit_set_gate(r, (enum gate)gate);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
+{
+    struct command c;
+    Py_buffer data;
+    const char *prefix;
+    double interval;
+    if (!PyArg_ParseTuple(args, "y*sd:set_polling", &data, &prefix, &interval))
+        return NULL;
+    int result = command_init(&c, &data, ACCEPT_REFUSED, prefix);
+    PyBuffer_Release(&data);
+    if (result < 0)
+        return NULL;
+    struct relay *r = relay_lock(self);
+    r->poll = c;
+    r->poll_interval_ns = seconds_to_ns(interval);
+    r->poll_at_ns = 0;
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"token", "data", "accept", "prefix", "timeout", NULL};
+    struct command c;
+    unsigned int token;
+    Py_buffer data;
+    int accept;
+    const char *prefix;
+    double timeout;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*isd:command", names, &token, &data, &accept, &prefix, &timeout))
+        return NULL;
+    int result = command_init(&c, &data, accept, prefix);
+    PyBuffer_Release(&data);
+    if (result < 0)
+        return NULL;
+    c.token = token;
+    c.timeout_ns = seconds_to_ns(timeout);
+    struct relay *r = relay_lock(self);
+    bool taken = r->port >= 0 && transmit_command(r, &c);
+    if (!taken) /* no port, or more commands waiting than can ever be meant */
+        relay_emit(r, EVENT_TIMEOUT, token, NULL, 0);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *event_object(const struct event *e)
+{
+    return Py_BuildValue("(iIy#)", e->kind, e->token, (const char *)e->text, (Py_ssize_t)e->length);
+}
+
+static PyObject *Relay_events(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    PyObject *list = PyList_New(0);
+    if (!list)
+        return NULL;
+    struct relay *r = self_relay(self);
+    uint64_t value;
+    ssize_t ignored = read(r->event_fd, &value, sizeof value);
+    (void)ignored;
+    for (;;) {
+        struct event e;
+        pthread_mutex_lock(&r->lock);
+        bool some = r->event_count > 0;
+        if (some) {
+            e = r->events[r->event_head];
+            r->event_head = (r->event_head + 1) % EVENTS_MAX;
+            r->event_count--;
+        }
+        relay_unlock(r);
+        if (!some)
+            return list;
+        PyObject *item = event_object(&e);
+        if (!item || PyList_Append(list, item) < 0) {
+            Py_XDECREF(item);
+            Py_DECREF(list);
+            return NULL;
+        }
+        Py_DECREF(item);
+    }
+}
+
+static int dict_set(PyObject *dict, const char *name, uint64_t value)
+{
+    PyObject *number = PyLong_FromUnsignedLongLong(value);
+    int result = number ? PyDict_SetItemString(dict, name, number) : -1;
+    Py_XDECREF(number);
+    return result;
+}
+
+static PyObject *reasons_dict(const char *const *names, const uint64_t *values, size_t n)
+{
+    PyObject *dict = PyDict_New();
+    for (size_t i = 0; dict && i < n; i++)
+        if (dict_set(dict, names[i], values[i]) < 0)
+            Py_CLEAR(dict);
+    return dict;
+}
+
+static PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64_t pending)
+{
+    const struct {
+        const char *name;
+        uint64_t value;
+    } plain[] = {
+        {"bus_read", c->bus_read},
+        {"tx_frames", c->confirmed},
+        {"tx_retries", c->retries},
+        {"queued", queued},
+        {"decoded", c->decoded},
+        {"rx_frames", c->delivered},
+        {"rx_pending", pending},
+        {"rx_stamped", c->stamped},
+        {"skipped_messages", c->skipped_messages},
+        {"skipped_bytes", c->skipped_bytes},
+        {"stray_answers", c->stray_answers},
+        {"resyncs", c->resyncs},
+        {"events_lost", c->events_lost},
+        {"turns", c->turns},
+    };
+    PyObject *dict = PyDict_New();
+    for (size_t i = 0; dict && i < sizeof plain / sizeof plain[0]; i++)
+        if (dict_set(dict, plain[i].name, plain[i].value) < 0)
+            Py_CLEAR(dict);
+    PyObject *tx = reasons_dict(TX_DROP_NAMES, c->tx_dropped, TX_DROPS);
+    PyObject *rx = reasons_dict(RX_DROP_NAMES, c->rx_dropped, RX_DROPS);
+    if (!dict || !tx || !rx || PyDict_SetItemString(dict, "tx_dropped", tx) < 0
+        || PyDict_SetItemString(dict, "rx_dropped", rx) < 0)
+        Py_CLEAR(dict);
+    Py_XDECREF(tx);
+    Py_XDECREF(rx);
+    return dict;
+}
+
+static PyObject *Relay_counters(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    const struct counters count = r->count;
+    uint64_t queued = transmit_queued(r), pending = r->rx_count;
+    relay_unlock(r);
+    return counters_dict(&count, queued, pending);
+}
+
+static PyMethodDef RELAY_METHODS[] = {
+    {"run", Relay_run, METH_NOARGS, NULL},
+    {"turn", Relay_turn, METH_O, NULL},
+    {"stop", Relay_stop, METH_NOARGS, NULL},
+    {"fileno", Relay_fileno, METH_NOARGS, NULL},
+    {"attach_port", Relay_attach_port, METH_O, NULL},
+    {"detach_port", Relay_detach_port, METH_NOARGS, NULL},
+    {"attach_bus", Relay_attach_bus, METH_O, NULL},
+    {"detach_bus", Relay_detach_bus, METH_NOARGS, NULL},
+    {"set_gates", (PyCFunction)(void (*)(void))Relay_set_gates, METH_VARARGS | METH_KEYWORDS, NULL},
+    {"set_polling", Relay_set_polling, METH_VARARGS, NULL},
+    {"command", (PyCFunction)(void (*)(void))Relay_command, METH_VARARGS | METH_KEYWORDS, NULL},
+    {"events", Relay_events, METH_NOARGS, NULL},
+    {"counters", Relay_counters, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyType_Slot RELAY_SLOTS[] = {
+    {Py_tp_doc, "Relay of frames between a port and a bus; see _relay.pyi."},
+    {Py_tp_new, Relay_new},
+    {Py_tp_dealloc, Relay_dealloc},
+    {Py_tp_methods, RELAY_METHODS},
+    {0, NULL},
+};
+
+static PyType_Spec RELAY_SPEC = {
+    .name = "bridged._relay.Relay",
+    .basicsize = sizeof(RelayObject),
+    .flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,
+    .slots = RELAY_SLOTS,
+};
+
+/* --- the codecs for tests --------------------------------------------------------------------- */
+
+static PyObject *message_object(const struct codec_message *msg, const struct can_frame *frame)
+{
+    static const char *const kinds[] = {"idle", "frame", "ok", "sent", "refused", "text", "skipped"};
+    if (msg->kind == CODEC_FRAME)
+        return Py_BuildValue("(sy#i)", "frame", (const char *)frame, (Py_ssize_t)sizeof *frame, msg->stamp_digits);
+    if (msg->kind == CODEC_TEXT)
+        return Py_BuildValue("(sy#i)", "text", (const char *)msg->text, (Py_ssize_t)msg->length, 0);
+    return Py_BuildValue("(sy#i)", kinds[msg->kind], "", (Py_ssize_t)0, (int)msg->length);
+}
+
+/* decode(codec, pieces): the messages of a stream that arrives in these pieces. */
+static PyObject *module_decode(PyObject *Py_UNUSED(module), PyObject *args)
+{
+    const char *name;
+    PyObject *pieces, *list = NULL;
+    if (!PyArg_ParseTuple(args, "sO!:decode", &name, &PyList_Type, &pieces))
+        return NULL;
+    const struct codec *codec = codec_by_name(name);
+    if (!codec || !(list = PyList_New(0)))
+        return NULL;
+    struct codec_state state = {0};
+    uint8_t buffer[8192];
+    size_t length = 0;
+    for (Py_ssize_t i = 0; i < PyList_Size(pieces); i++) {
+        char *bytes;
+        Py_ssize_t n;
+        if (PyBytes_AsStringAndSize(PyList_GetItem(pieces, i), &bytes, &n) < 0)
+            goto failed;
+        if ((size_t)n > sizeof buffer - length) {
+            PyErr_SetString(PyExc_ValueError, "piece too long");
+            goto failed;
+        }
+        memcpy(buffer + length, bytes, (size_t)n);
+        length += (size_t)n;
+        struct can_frame frame;
+        struct codec_message msg;
+        size_t at = 0, used;
+        while (at < length && (used = codec->decode(&state, buffer + at, length - at, &frame, &msg))) {
+            at += used;
+            PyObject *item = message_object(&msg, &frame);
+            int result = item ? PyList_Append(list, item) : -1;
+            Py_XDECREF(item);
+            if (result < 0)
+                goto failed;
+        }
+        length -= at;
+        memmove(buffer, buffer + at, length);
+    }
+    return list;
+failed:
+    Py_DECREF(list);
+    return NULL;
+}
+
+/* encode(codec, frame): the bytes for one struct can_frame; empty if it cannot be said. */
+static PyObject *module_encode(PyObject *Py_UNUSED(module), PyObject *args)
+{
+    const char *name;
+    Py_buffer data;
+    PyObject *result = NULL;
+    if (!PyArg_ParseTuple(args, "sy*:encode", &name, &data))
+        return NULL;
+    const struct codec *codec = codec_by_name(name);
+    struct can_frame frame;
+    if (codec && data.len == sizeof frame) {
+        uint8_t out[64];
+        memcpy(&frame, data.buf, sizeof frame);
+        result = PyBytes_FromStringAndSize((const char *)out, (Py_ssize_t)codec->encode(&frame, out));
+    } else if (codec) {
+        PyErr_SetString(PyExc_ValueError, "a frame has the 16 bytes of struct can_frame");
+    }
+    PyBuffer_Release(&data);
+    return result;
+}
+
+static PyObject *module_clock(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(ignored))
+{
+    return PyLong_FromLongLong(relay_clock());
+}
+
+static PyMethodDef MODULE_METHODS[] = {
+    {"decode", module_decode, METH_VARARGS, NULL},
+    {"encode", module_encode, METH_VARARGS, NULL},
+    {"clock", module_clock, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static int module_exec(PyObject *module)
+{
+    PyObject *type = PyType_FromModuleAndSpec(module, &RELAY_SPEC, NULL);
+    int result = type ? PyModule_AddObjectRef(module, "Relay", type) : -1;
+    Py_XDECREF(type);
+    for (size_t i = 0; result == 0 && i < sizeof CONSTANTS / sizeof CONSTANTS[0]; i++)
+        result = PyModule_AddIntConstant(module, CONSTANTS[i].name, CONSTANTS[i].value);
+    return result;
+}
+
+static PyModuleDef_Slot MODULE_SLOTS[] = {{Py_mod_exec, (void *)module_exec}, {0, NULL}};
+
+static struct PyModuleDef MODULE = {
+    PyModuleDef_HEAD_INIT,
+    .m_name = "bridged._relay",
+    .m_doc = "The data plane of can-bridge.",
+    .m_methods = MODULE_METHODS,
+    .m_slots = MODULE_SLOTS,
+};
+
+PyMODINIT_FUNC PyInit__relay(void)
+{
+    return PyModuleDef_Init(&MODULE);
+}

@@ -1,0 +1,406 @@
+/* The loop: waits, reads the port and the bus in batches, hands bytes to the codec and frames on. */
+#include "relay.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <time.h>
+#include <unistd.h>
+
+#define RX_STALL_NS INT64_C(100000000) /* how long frames wait for a full bus queue */
+#define RX_RETRY_NS INT64_C(1000000)
+
+/* Counts on while the machine is suspended, so that frames grow old in their sleep too. */
+int64_t relay_clock(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_BOOTTIME, &t);
+    return t.tv_sec * NS_PER_S + t.tv_nsec;
+}
+
+/* --- life ------------------------------------------------------------------------------------ */
+
+/* Fixed parts of the message headers; what the kernel writes back is renewed before each call. */
+static void message_headers_init(struct relay *r)
+{
+    for (int i = 0; i < RX_BATCH; i++) {
+        r->rx_iov[i] = (struct iovec){&r->rx[i], sizeof r->rx[i]};
+        r->rx_msg[i].msg_hdr = (struct msghdr){.msg_iov = &r->rx_iov[i], .msg_iovlen = 1};
+    }
+    for (int i = 0; i < BUS_BATCH; i++) {
+        r->bus_iov[i] = (struct iovec){&r->bus_message[i].frame, sizeof r->bus_message[i].frame};
+        r->bus_msg[i].msg_hdr = (struct msghdr){
+            .msg_iov = &r->bus_iov[i],
+            .msg_iovlen = 1,
+            .msg_control = &r->bus_message[i].control,
+        };
+    }
+}
+
+struct relay *relay_new(const struct settings *set)
+{
+    struct relay *r = calloc(1, sizeof *r);
+    if (!r)
+        return NULL;
+    r->set = *set;
+    r->port = r->bus = r->wake_fd = r->event_fd = -1;
+    r->rx_stalled_ns = r->rx_retry_ns = NEVER;
+    r->queue = calloc(set->queue, sizeof *r->queue);
+    r->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    r->event_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    if (!r->queue || r->wake_fd < 0 || r->event_fd < 0) {
+        int error = errno;
+        relay_free(r);
+        errno = error;
+        return NULL;
+    }
+    pthread_mutex_init(&r->lock, NULL);
+    message_headers_init(r);
+    transmit_reset(r);
+    return r;
+}
+
+void relay_free(struct relay *r)
+{
+    if (r->wake_fd >= 0)
+        close(r->wake_fd);
+    if (r->event_fd >= 0)
+        close(r->event_fd);
+    free(r->queue);
+    free(r);
+}
+
+/* An eventfd is full only after 2^64 writes nobody read: the result cannot matter. */
+static void eventfd_raise(int fd)
+{
+    uint64_t one = 1;
+    ssize_t ignored = write(fd, &one, sizeof one);
+    (void)ignored;
+}
+
+void relay_wake(struct relay *r)
+{
+    eventfd_raise(r->wake_fd);
+}
+
+void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length)
+{
+    if (r->event_count == EVENTS_MAX) {
+        r->count.events_lost++;
+        return;
+    }
+    struct event *e = &r->events[(r->event_head + r->event_count++) % EVENTS_MAX];
+    e->kind = (uint8_t)kind;
+    e->token = token;
+    e->length = (uint16_t)(length < EVENT_SIZE ? length : EVENT_SIZE);
+    if (e->length)
+        memcpy(e->text, text, e->length);
+    eventfd_raise(r->event_fd);
+}
+
+/* --- device -> bus --------------------------------------------------------------------------- */
+
+static void rx_drop(struct relay *r, uint32_t n, enum rx_drop reason)
+{
+    r->count.rx_dropped[reason] += n;
+    r->rx_count -= n;
+    memmove(r->rx, r->rx + n, r->rx_count * sizeof r->rx[0]);
+}
+
+static void bus_lost(struct relay *r, int error)
+{
+    if (r->bus < 0)
+        return;
+    r->bus = -1;
+    relay_emit(r, EVENT_BUS_LOST, (uint32_t)error, NULL, 0);
+}
+
+/* EINTR: again. EAGAIN, ENOBUFS: the bus queue is full: wait a little, then drop. ENETDOWN: down,
+ * may come back by itself. Anything else: the interface is gone. */
+static void rx_failed(struct relay *r, int error, int64_t now)
+{
+    if (error == EAGAIN || error == ENOBUFS) {
+        if (r->rx_stalled_ns == NEVER)
+            r->rx_stalled_ns = now;
+        r->rx_retry_ns = now + RX_RETRY_NS;
+        if (now - r->rx_stalled_ns > RX_STALL_NS)
+            rx_drop(r, r->rx_count, RX_BUS_FULL);
+        return;
+    }
+    if (error == ENETDOWN) {
+        rx_drop(r, r->rx_count, RX_BUS_DOWN);
+        return;
+    }
+    bus_lost(r, error);
+    rx_drop(r, r->rx_count, RX_BUS_LOST);
+}
+
+/* Puts the decoded frames on the bus. */
+static void rx_flush(struct relay *r, int64_t now)
+{
+    if (r->bus < 0)
+        rx_drop(r, r->rx_count, RX_BUS_LOST);
+    while (r->rx_count) {
+        int n = sendmmsg(r->bus, r->rx_msg, r->rx_count, MSG_DONTWAIT | MSG_NOSIGNAL);
+        if (n < 0 && errno == EINTR)
+            continue;
+        if (n < 0) {
+            rx_failed(r, errno, now);
+            break;
+        }
+        r->count.delivered += (uint64_t)n;
+        r->rx_count -= (uint32_t)n;
+        r->rx_stalled_ns = NEVER;
+        memmove(r->rx, r->rx + n, r->rx_count * sizeof r->rx[0]);
+    }
+    if (!r->rx_count)
+        r->rx_stalled_ns = r->rx_retry_ns = NEVER;
+}
+
+static void rx_frame(struct relay *r, const struct codec_message *msg)
+{
+    r->count.decoded++;
+    if (msg->stamp_digits) {
+        if (!r->stamp_seen)
+            relay_emit(r, EVENT_STAMPED, msg->stamp_digits, NULL, 0);
+        r->stamp_seen = true;
+        r->count.stamped++;
+    }
+    if (r->receiving)
+        r->rx_count++;
+    else
+        r->count.rx_dropped[RX_NOT_RUNNING]++;
+}
+
+/* Decodes what is in the port buffer; an incomplete message stays there. */
+static void port_decode(struct relay *r, int64_t now)
+{
+    struct can_frame spare;
+    struct codec_message msg;
+    size_t at = 0, used;
+
+    for (; at < r->in_length; at += used) {
+        if (r->rx_count == RX_BATCH)
+            rx_flush(r, now);
+        struct can_frame *frame = r->rx_count < RX_BATCH ? &r->rx[r->rx_count] : &spare;
+        used = r->set.codec->decode(&r->decoder, r->in + at, r->in_length - at, frame, &msg);
+        if (!used)
+            break;
+        if (msg.kind == CODEC_FRAME && frame == &spare && r->receiving) {
+            r->count.decoded++;
+            r->count.rx_dropped[RX_BUS_FULL]++;
+        } else if (msg.kind == CODEC_FRAME) {
+            rx_frame(r, &msg);
+        } else if (msg.kind == CODEC_SKIPPED) {
+            r->count.skipped_messages++;
+            r->count.skipped_bytes += msg.length;
+        } else if (msg.kind != CODEC_IDLE) {
+            transmit_answer(r, &msg, now);
+        }
+    }
+    r->in_length -= at;
+    memmove(r->in, r->in + at, r->in_length);
+    rx_flush(r, now);
+}
+
+void relay_port_lost(struct relay *r, int error)
+{
+    if (r->port < 0)
+        return;
+    relay_emit(r, EVENT_PORT_LOST, (uint32_t)error, NULL, 0); /* the cause before what it causes */
+    relay_detach_port(r);
+}
+
+/* EINTR, EAGAIN: poll tells when. 0: hang-up or end of file. Anything else: the port is gone. */
+static void port_read(struct relay *r, int64_t now)
+{
+    ssize_t n = read(r->port, r->in + r->in_length, sizeof r->in - r->in_length);
+    if (n < 0 && (errno == EINTR || errno == EAGAIN))
+        return;
+    if (n <= 0) {
+        relay_port_lost(r, n ? errno : 0);
+        return;
+    }
+    r->in_length += (size_t)n;
+    port_decode(r, now);
+}
+
+/* --- bus -> device --------------------------------------------------------------------------- */
+
+/* Age of a frame by the kernel's time stamp, 0 without one. A step of the wall clock can make it
+ * wrong either way for the frames in the socket at that moment; never below 0. */
+static int64_t message_age(const struct msghdr *h, int64_t wall_ns)
+{
+    for (struct cmsghdr *c = CMSG_FIRSTHDR(h); c; c = CMSG_NXTHDR((struct msghdr *)(uintptr_t)h, c)) {
+        if (c->cmsg_level != SOL_SOCKET || c->cmsg_type != SCM_TIMESTAMPNS)
+            continue;
+        struct timespec t;
+        memcpy(&t, CMSG_DATA(c), sizeof t);
+        int64_t age = wall_ns - (t.tv_sec * NS_PER_S + t.tv_nsec);
+        return age > 0 ? age : 0;
+    }
+    return 0;
+}
+
+static void bus_message(struct relay *r, struct mmsghdr *m, const struct bus_message *b, int64_t wall_ns, int64_t now)
+{
+    r->count.bus_read++;
+    if (m->msg_len == CANFD_MTU)
+        transmit_drop(r, TX_FD_FRAME);
+    else if (m->msg_len != CAN_MTU)
+        transmit_drop(r, TX_MALFORMED);
+    else if (b->frame.classic.can_id & CAN_ERR_FLAG)
+        transmit_drop(r, TX_ERROR_FRAME);
+    else
+        transmit_enqueue(r, &b->frame.classic, now - message_age(&m->msg_hdr, wall_ns), now);
+}
+
+/* EINTR, EAGAIN: poll tells when. ENETDOWN: the interface went down; said, the socket stays.
+ * An empty message is the end of a socketpair. Anything else: the interface is gone. */
+static void bus_read(struct relay *r, int64_t now)
+{
+    for (int i = 0; i < BUS_BATCH; i++)
+        r->bus_msg[i].msg_hdr.msg_controllen = sizeof r->bus_message[i].control;
+    int n = recvmmsg(r->bus, r->bus_msg, BUS_BATCH, MSG_DONTWAIT, NULL);
+    if (n < 0 && (errno == EINTR || errno == EAGAIN))
+        return;
+    if (n < 0 && errno == ENETDOWN) {
+        relay_emit(r, EVENT_BUS_DOWN, 0, NULL, 0);
+        return;
+    }
+    if (n < 0) {
+        bus_lost(r, errno);
+        return;
+    }
+    struct timespec t;
+    clock_gettime(CLOCK_REALTIME, &t);
+    int64_t wall_ns = t.tv_sec * NS_PER_S + t.tv_nsec;
+    for (int i = 0; i < n; i++) {
+        if (r->bus_msg[i].msg_len == 0) {
+            bus_lost(r, 0);
+            return;
+        }
+        bus_message(r, &r->bus_msg[i], &r->bus_message[i], wall_ns, now);
+    }
+}
+
+/* --- attach, detach: lock held --------------------------------------------------------------- */
+
+void relay_attach_port(struct relay *r, int fd)
+{
+    relay_detach_port(r);
+    r->port = fd;
+}
+
+/* The descriptor stays its owner's to close. What it said in part is noise. */
+void relay_detach_port(struct relay *r)
+{
+    r->attachments++;
+    r->port = -1;
+    r->receiving = false;
+    if (r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY)
+        r->gate = GATE_AWAY;
+    if (r->in_length) {
+        r->count.skipped_messages++;
+        r->count.skipped_bytes += r->in_length;
+        r->in_length = 0;
+    }
+    r->decoder = (struct codec_state){0};
+    r->stamp_seen = false;
+    transmit_reset(r);
+}
+
+void relay_attach_bus(struct relay *r, int fd)
+{
+    r->attachments++;
+    r->bus = fd;
+}
+
+/* --- the loop -------------------------------------------------------------------------------- */
+
+static int64_t next_deadline(const struct relay *r)
+{
+    int64_t at = transmit_deadline(r);
+    return r->rx_retry_ns < at ? r->rx_retry_ns : at;
+}
+
+/* Waits without the lock until something is there or `until` has come. Never fails for long: EINTR
+ * cannot happen with all signals blocked, EINVAL and ENOMEM would be bugs that show as a busy loop. */
+static bool wait_ready(struct relay *r, struct pollfd fds[3], int64_t now, int64_t until)
+{
+    struct timespec t = {0}, *timeout = until == NEVER ? NULL : &t;
+    if (until > now && timeout) {
+        t.tv_sec = (until - now) / NS_PER_S;
+        t.tv_nsec = (until - now) % NS_PER_S;
+    }
+    fds[0] = (struct pollfd){.fd = r->wake_fd, .events = POLLIN};
+    fds[1] = (struct pollfd){.fd = r->port, .events = POLLIN};
+    fds[2] = (struct pollfd){.fd = r->bus, .events = POLLIN};
+    if (r->out_start < r->out_end)
+        fds[1].events |= POLLOUT;
+    uint32_t attachments = r->attachments;
+    pthread_mutex_unlock(&r->lock);
+    int n = ppoll(fds, 3, timeout, NULL);
+    pthread_mutex_lock(&r->lock);
+    r->count.turns++;
+    if (fds[0].revents) {
+        uint64_t value;
+        ssize_t ignored = read(r->wake_fd, &value, sizeof value);
+        (void)ignored;
+    }
+    return n > 0 && attachments == r->attachments;
+}
+
+/* What has come is handled, what may go is sent. `now` is the time of this turn. */
+static void handle_ready(struct relay *r, const struct pollfd fds[3], int64_t now)
+{
+    if (fds[1].revents & ~POLLOUT && r->port >= 0)
+        port_read(r, now);
+    if (fds[2].revents && r->bus >= 0)
+        bus_read(r, now);
+}
+
+static int64_t turn(struct relay *r, const struct pollfd *ready, int64_t now)
+{
+    if (ready)
+        handle_ready(r, ready, now);
+    if (r->rx_retry_ns <= now)
+        rx_flush(r, now);
+    transmit_pump(r, now);
+    return next_deadline(r);
+}
+
+/* One turn without waiting, at a time of the caller's choice: tests run the relay on their own clock. */
+int64_t relay_turn(struct relay *r, int64_t now)
+{
+    struct pollfd fds[3];
+    return turn(r, wait_ready(r, fds, now, now) ? fds : NULL, now);
+}
+
+/* Turns until relay_stop. Returns at once with EBUSY if another thread runs it. */
+int relay_run(struct relay *r)
+{
+    sigset_t all, before;
+    sigfillset(&all);
+    pthread_sigmask(SIG_BLOCK, &all, &before); /* signals are for Python's main thread */
+    pthread_mutex_lock(&r->lock);
+    int result = r->running ? EBUSY : 0;
+    if (!result) {
+        r->running = true;
+        int64_t now = relay_clock();
+        int64_t until = turn(r, NULL, now);
+        while (!r->stop) {
+            struct pollfd fds[3];
+            bool ready = wait_ready(r, fds, now, until);
+            now = relay_clock();
+            until = turn(r, ready ? fds : NULL, now);
+        }
+        r->running = r->stop = false;
+    }
+    pthread_mutex_unlock(&r->lock);
+    pthread_sigmask(SIG_SETMASK, &before, NULL);
+    return result;
+}

@@ -1,0 +1,226 @@
+/* The relay: moves frames between a port (bytes) and a bus (struct can_frame), with full accounting.
+ *
+ * One thread runs relay_run(). Everything in struct relay is guarded by `lock`, which that thread
+ * holds all the time except while it waits in ppoll(). So any other thread that takes the lock sees
+ * the relay between two turns: the counters of a snapshot add up.
+ *
+ *   frames read from the bus = confirmed + dropped (by reason) + queued
+ *   frames decoded from the port = put on the bus + dropped (by reason) + pending
+ */
+#ifndef CAN_BRIDGE_RELAY_H
+#define CAN_BRIDGE_RELAY_H
+
+#include <pthread.h>
+#include <sys/socket.h>
+
+#include "codec.h"
+
+#define NS_PER_S INT64_C(1000000000)
+#define NEVER INT64_MAX
+
+enum {
+    BUS_BATCH = 64,       /* frames per recvmmsg */
+    RX_BATCH = 256,       /* frames per sendmmsg, and how many may wait for a full bus queue */
+    WINDOW_MAX = 32,      /* commands unanswered, as configured */
+    INFLIGHT_MAX = 64,    /* ring: WINDOW_MAX and the sync command behind them */
+    RETRY_MAX = 64,       /* ring: refused frames wait here; never more than were in flight */
+    COMMANDS_MAX = 32,    /* ring: commands from Python that wait for their turn */
+    COMMAND_SIZE = 64,    /* bytes of one command */
+    EVENTS_MAX = 256,     /* ring: events that Python has not fetched yet */
+    EVENT_SIZE = 256,     /* bytes of text in one event */
+    PORT_BUFFER = 65536,  /* bytes read from the port and not decoded yet */
+    OUT_BUFFER = 4096,    /* bytes encoded and not taken by the port yet */
+    SYNC_TRIES = 3,       /* unanswered sync commands until the adapter counts as silent */
+};
+
+/* Why a frame from the bus was not sent. Order of TX_DROP_NAMES in module.c. */
+enum tx_drop {
+    TX_ERROR_FRAME,  /* error frames are the bus's own affair */
+    TX_FD_FRAME,     /* the adapter knows classic CAN only */
+    TX_MALFORMED,    /* no struct can_frame, or one the protocol cannot say */
+    TX_QUEUE_FULL,   /* the transmit queue was full */
+    TX_STALE,        /* older than the deadline before its turn came */
+    TX_REFUSED,      /* the adapter refused it until its deadline */
+    TX_OVERTAKEN,    /* refused, and a later frame was taken: sending it now would swap them */
+    TX_UNANSWERED,   /* sent, but no answer came: it may or may not be on the bus, so it is not sent again */
+    TX_AWAY,         /* no adapter, or not initialised */
+    TX_LISTEN_ONLY,  /* the channel is listen-only */
+    TX_STOPPED,      /* the bridge is stopping */
+    TX_DROPS,
+};
+
+/* Why a frame from the adapter did not reach the bus. Order of RX_DROP_NAMES in module.c. */
+enum rx_drop {
+    RX_NOT_RUNNING, /* decoded while the adapter was being initialised or closed */
+    RX_BUS_FULL,    /* ENOBUFS, EAGAIN for longer than RX_STALL_NS, or more than RX_BATCH waiting */
+    RX_BUS_DOWN,    /* ENETDOWN */
+    RX_BUS_LOST,    /* interface gone, or none attached */
+    RX_DROPS,
+};
+
+/* What happens to frames read from the bus. */
+enum gate { GATE_AWAY, GATE_OPEN, GATE_LISTEN_ONLY, GATE_STOPPED, GATES };
+
+enum event_kind {
+    EVENT_OK,        /* a command was answered "done" */
+    EVENT_REFUSED,   /* a command was refused */
+    EVENT_TEXT,      /* a command was answered with a text */
+    EVENT_TIMEOUT,   /* a command was not answered in time, or the port went away before */
+    EVENT_UNASKED,   /* a text that no command asked for */
+    EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many so far. Said once per series */
+    EVENT_UNANSWERED,    /* an answer is missing: the line is being resynchronised */
+    EVENT_SILENT,    /* not even the sync command is answered; nothing is sent until a new attach */
+    EVENT_STAMPED,   /* a frame had a time stamp; said once per attach */
+    EVENT_PORT_LOST, /* token: errno, 0 for end of file */
+    EVENT_BUS_DOWN,  /* the interface is down */
+    EVENT_BUS_LOST,  /* token: errno, 0 for end of file */
+    EVENT_KINDS,
+};
+
+/* Answers that settle a command; a text settles it when it begins with the command's prefix. */
+enum { ACCEPT_OK = 1, ACCEPT_REFUSED = 2 };
+
+struct tx_frame {
+    struct can_frame frame;
+    int64_t born_ns; /* when the kernel received it, on the relay's clock */
+    uint64_t number; /* order on the bus */
+};
+
+struct command {
+    uint32_t token;
+    uint8_t accept; /* ACCEPT_… */
+    uint8_t prefix; /* first character of the text that answers; 0: none */
+    uint8_t length;
+    int64_t timeout_ns;
+    uint8_t data[COMMAND_SIZE];
+};
+
+enum inflight_kind { INFLIGHT_FRAME, INFLIGHT_COMMAND, INFLIGHT_POLL, INFLIGHT_SYNC };
+
+struct inflight {
+    enum inflight_kind kind;
+    uint8_t accept;
+    uint8_t prefix;
+    uint32_t token;
+    int64_t deadline_ns; /* of the answer */
+    struct tx_frame tx;
+};
+
+struct event {
+    uint8_t kind;
+    uint16_t length;
+    uint32_t token;
+    uint8_t text[EVENT_SIZE];
+};
+
+struct counters {
+    uint64_t bus_read;  /* frames read from the bus */
+    uint64_t confirmed; /* frames that the adapter took */
+    uint64_t retries;   /* frames sent once more after a refusal */
+    uint64_t tx_dropped[TX_DROPS];
+    uint64_t decoded;   /* frames decoded from the port */
+    uint64_t delivered; /* frames put on the bus */
+    uint64_t rx_dropped[RX_DROPS];
+    uint64_t stamped;          /* frames that carried a time stamp */
+    uint64_t skipped_messages; /* pieces of noise between messages */
+    uint64_t skipped_bytes;
+    uint64_t stray_answers;    /* answers that nothing was waiting for */
+    uint64_t resyncs;
+    uint64_t events_lost;
+    uint64_t turns; /* how often the loop woke */
+};
+
+struct settings {
+    const struct codec *codec;
+    uint32_t queue;
+    uint32_t window;
+    int64_t deadline_ns;       /* a frame older than this is not sent */
+    int64_t answer_timeout_ns; /* of a frame, a poll, a sync command */
+    struct command sync;       /* a command with an answer that nothing else gives */
+};
+
+struct relay {
+    pthread_mutex_t lock; /* guards all below */
+    struct settings set;
+    bool stop, running;
+    int wake_fd;  /* eventfd: another thread changed something */
+    int event_fd; /* eventfd: events to fetch */
+    int port, bus;
+    uint32_t attachments; /* counts attach and detach: results of a ppoll before one are void */
+    enum gate gate;
+    bool receiving;
+
+    /* bus -> device (transmit.c) */
+    struct tx_frame *queue; /* ring of set.queue */
+    uint32_t queue_head, queue_count;
+    uint64_t next_number;
+    struct tx_frame retry[RETRY_MAX];
+    uint32_t retry_head, retry_count;
+    int64_t retry_at_ns, retry_delay_ns;
+    struct inflight inflight[INFLIGHT_MAX];
+    uint32_t inflight_head, inflight_count;
+    struct command commands[COMMANDS_MAX];
+    uint32_t command_head, command_count;
+    struct command poll; /* length 0: the device speaks by itself */
+    int64_t poll_interval_ns, poll_at_ns;
+    uint64_t poll_decoded; /* counters.decoded when the last poll was sent */
+    bool polling, resyncing, silent;
+    uint32_t sync_tries;
+    uint8_t out[OUT_BUFFER];
+    size_t out_start, out_end;
+
+    /* device -> bus (relay.c) */
+    struct codec_state decoder;
+    bool stamp_seen;
+    uint8_t in[PORT_BUFFER];
+    size_t in_length;
+    struct can_frame rx[RX_BATCH];
+    struct iovec rx_iov[RX_BATCH];
+    struct mmsghdr rx_msg[RX_BATCH];
+    uint32_t rx_count;
+    int64_t rx_stalled_ns, rx_retry_ns; /* NEVER: the bus takes frames */
+
+    struct bus_message {
+        union {
+            struct can_frame classic;
+            struct canfd_frame fd;
+        } frame;
+        union {
+            struct cmsghdr align;
+            uint8_t bytes[128];
+        } control;
+    } bus_message[BUS_BATCH];
+    struct iovec bus_iov[BUS_BATCH];
+    struct mmsghdr bus_msg[BUS_BATCH];
+
+    struct event events[EVENTS_MAX];
+    uint32_t event_head, event_count;
+    struct counters count;
+};
+
+/* relay.c */
+struct relay *relay_new(const struct settings *set); /* NULL with errno */
+void relay_free(struct relay *r);
+int64_t relay_clock(void);
+int relay_run(struct relay *r);                    /* takes the lock; -> 0 or errno */
+int64_t relay_turn(struct relay *r, int64_t now); /* lock held; -> next deadline */
+void relay_wake(struct relay *r);
+void relay_attach_port(struct relay *r, int fd);
+void relay_detach_port(struct relay *r);
+void relay_attach_bus(struct relay *r, int fd);
+void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length);
+void relay_port_lost(struct relay *r, int error);
+
+/* transmit.c: all with the lock held */
+void transmit_enqueue(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now);
+void transmit_drop(struct relay *r, enum tx_drop reason);
+void transmit_set_gate(struct relay *r, enum gate gate);
+void transmit_expire(struct relay *r, int64_t now);
+void transmit_reset(struct relay *r);
+bool transmit_command(struct relay *r, const struct command *command);
+void transmit_pump(struct relay *r, int64_t now);
+int64_t transmit_deadline(const struct relay *r);
+uint32_t transmit_queued(const struct relay *r);
+void transmit_answer(struct relay *r, const struct codec_message *msg, int64_t now);
+
+#endif

@@ -1,0 +1,135 @@
+"""The status of a running bridge over a local socket: one JSON object for each connection.
+
+name, state, reason, adapter {type, port, version, serial_number}, bus {interface, channel},
+counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
+from the adapter; tx_retries; tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
+At any moment bus_read = tx_frames + queued + tx_dropped (but for those lost before they could be read).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from bridged.errors import BridgeError
+
+ANSWER_TIMEOUT_S = 5.0
+LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow")
+
+
+class StatusError(BridgeError):
+    """The status socket could not be made, or nobody answers on it."""
+
+
+def runtime_directory() -> Path:
+    """/run/can-bridge for root, below XDG_RUNTIME_DIR for anybody else."""
+    if os.geteuid() == 0:
+        return Path("/run/can-bridge")
+    base = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/can-bridge-{os.geteuid()}"  # noqa: S108
+    return Path(base) / "can-bridge"
+
+
+def socket_path(name: str) -> Path:
+    return runtime_directory() / f"{name}.sock"
+
+
+class StatusServer:
+    """Listens on a Unix socket; on_readable() answers everybody who waits, without ever waiting itself."""
+
+    def __init__(self, path: Path, snapshot: Callable[[], dict[str, Any]]) -> None:
+        """StatusError: another bridge listens there, or the socket cannot be made."""
+        self.path = path
+        self._snapshot = snapshot
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+            if _somebody_listens(path):
+                msg = f"a bridge named {path.stem!r} is running already (it answers on {path})"
+                raise StatusError(msg)
+            path.unlink(missing_ok=True)
+            self._socket.bind(str(path))
+            self._socket.listen(16)
+        except OSError as error:
+            self._socket.close()
+            msg = f"cannot make the status socket {path}: {error.strerror or error}; --socket PATH puts it elsewhere"
+            raise StatusError(msg) from error
+        except StatusError:
+            self._socket.close()
+            raise
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def on_readable(self) -> None:
+        for connection in self._waiting():
+            with connection, contextlib.suppress(OSError):  # who hangs up early gets nothing
+                connection.setblocking(False)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 18)
+                connection.sendall(json.dumps(self._snapshot()).encode() + b"\n")
+
+    def _waiting(self) -> Iterator[socket.socket]:
+        while True:
+            try:
+                yield self._socket.accept()[0]
+            except OSError:
+                return
+
+    def close(self) -> None:
+        self._socket.close()
+        self.path.unlink(missing_ok=True)
+
+
+def _somebody_listens(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except TimeoutError:
+            return True
+        except OSError:
+            return False
+        return True
+
+
+def query(path: Path) -> dict[str, Any]:
+    """The status of the bridge behind `path`. StatusError: none is running there."""
+    data = b""
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+            client.settimeout(ANSWER_TIMEOUT_S)
+            client.connect(str(path))
+            while chunk := client.recv(65536):
+                data += chunk
+        status = json.loads(data)
+    except (OSError, ValueError) as error:
+        msg = f"no bridge answers on {path}: {error}"
+        raise StatusError(msg) from error
+    assert isinstance(status, dict)
+    return status
+
+
+def _reasons(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{reason} {n}" for reason, n in dropped.items() if n) or "none"
+
+
+def render(status: dict[str, Any]) -> str:
+    """The status for a human."""
+    adapter, counters, bus = status["adapter"], status["counters"], status["bus"]
+    reason = f" ({status['reason']})" if status["reason"] else ""
+    identity = f"version {adapter['version'] or '?'}, serial number {adapter['serial_number'] or '?'}"
+    return "\n".join(
+        [
+            f"{status['name']}: {status['state']}{reason}, up {status['uptime_s']:.0f} s",
+            f"  adapter     {adapter['type']} on {adapter['port']}, {identity}",
+            f"  bus         {bus['interface']} {bus['channel']}",
+            f"  to bus      {counters['rx_frames']} frames, {counters['rx_errors']} errors on the line",
+            f"  dropped     {_reasons(counters['rx_dropped'])}",
+            f"  to adapter  {counters['tx_frames']} frames, {counters['tx_retries']} retries, {status['queued']} queued",
+            f"  dropped     {_reasons(counters['tx_dropped'])}",
+        ]
+    )
