@@ -12,6 +12,7 @@ import os
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from bridged.buses import open_bus
 from bridged.errors import AdapterError, BusError, PortError, WrongDeviceError
 from bridged.lifecycle import Action, Backoff, Event, State, transition
 from bridged.ports import open_port
+from bridged.status import LOST_BEFORE_READ
 
 if TYPE_CHECKING:
     from bridged.adapters.base import Memory
@@ -68,6 +70,7 @@ class Bridge:
         self._bus: Bus | None = None
         self._timer: float | None = None
         self._bus_timer: float | None = None
+        self._lost_on_buses: Counter[str] = Counter()  # on buses that were closed since
         self._backoff = Backoff(RECONNECT_INITIAL_S, RECONNECT_MAXIMUM_S)
         self._steps: Steps | None = None
         self._tokens = itertools.count(1)
@@ -125,12 +128,13 @@ class Bridge:
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""
-        counters = self._relay.counters()
-        tx_dropped, rx_dropped = counters.pop("tx_dropped"), counters.pop("rx_dropped")
-        if self._bus is not None:
-            for reasons, more in ((tx_dropped, self._bus.tx_lost()), (rx_dropped, self._bus.rx_lost())):
-                assert isinstance(reasons, dict)
-                reasons.update(more)
+        counters: dict[str, Any] = self._relay.counters()
+        for reason, n in (self._lost_on_buses + self._lost_on_bus()).items():
+            if reason in LOST_BEFORE_READ:
+                counters["tx_dropped"][reason] = n
+            else:  # the relay took it for delivered
+                counters["rx_dropped"][reason] = n
+                counters["rx_frames"] -= n
         queued = counters.pop("queued")
         identity = self.adapter.identity
         return {
@@ -149,8 +153,6 @@ class Bridge:
                 "tx_frames": counters.pop("tx_frames"),
                 "rx_errors": counters.pop("skipped_messages"),
                 "tx_retries": counters.pop("tx_retries"),
-                "tx_dropped": tx_dropped,
-                "rx_dropped": rx_dropped,
                 **counters,
             },
             "queued": queued,
@@ -162,7 +164,7 @@ class Bridge:
     def _open_bus(self) -> None:
         bus = self.config.bus
         try:
-            self._bus = open_bus(bus)
+            self._bus = open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options)
         except BusError as error:
             if self.reason != str(error):
                 log.error("bus not open: %s; trying again every %g s", error, BUS_RETRY_S)
@@ -180,10 +182,19 @@ class Bridge:
         if self._bus is None:
             return
         log.error("bus lost: %s: %s; opening it again", self._bus.description, self._bus.failure or _reason(error))
+        self._close_bus()
+        self._bus_timer = time.monotonic()
+
+    def _lost_on_bus(self) -> Counter[str]:
+        return Counter(self._bus.dropped() if self._bus else {})
+
+    def _close_bus(self) -> None:
+        if self._bus is None:
+            return
         self._relay.detach_bus()
+        self._lost_on_buses += self._lost_on_bus()
         self._bus.close()
         self._bus = None
-        self._bus_timer = time.monotonic()
 
     # --- lifecycle ----------------------------------------------------------------------------
 
@@ -270,10 +281,7 @@ class Bridge:
 
     def close(self) -> None:
         """After `finished`: gives the bus back."""
-        if self._bus is not None:
-            self._relay.detach_bus()
-            self._bus.close()
-            self._bus = None
+        self._close_bus()
 
     # --- exchanges ----------------------------------------------------------------------------
 

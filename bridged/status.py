@@ -3,7 +3,7 @@
 name, state, reason, adapter {type, port, version, serial_number}, bus {interface, channel},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
 from the adapter; tx_retries; tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
-At any moment bus_read = tx_frames + queued + tx_dropped (but for those lost before they could be read).
+At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_READ).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import Any
 from bridged.errors import BridgeError
 
 ANSWER_TIMEOUT_S = 5.0
-LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow")
+# Reasons in tx_dropped for frames that were lost before the relay could read them.
+LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow", "bus-recv-failed")
 
 
 class StatusError(BridgeError):

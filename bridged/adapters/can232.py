@@ -74,23 +74,23 @@ class Can232:
     # --- start and end ------------------------------------------------------------------------
 
     def init_steps(self) -> Steps:
-        """Flush, close, identify, configure, open (manual 1.4), then see that it polls by itself."""
+        """Flush, close, identify, configure, open (manual 1.4), then mend what its EEPROM has wrong."""
         self.polling = None
         yield from self._flush()
         yield from self._identify()
         yield from self._configure()
         yield from self._open()
-        if (yield from self._auto_poll()):
-            return
-        if (self.identity.version or "")[1:] >= AUTO_POLL_SINCE:
+        auto_poll = yield from self._auto_poll()
+        differences = self._eeprom_differences(auto_poll)
+        if differences:
             yield from self._close()
-            switched = yield self._step(b"X1\r", "send frames by itself", (OK, REFUSED), (NONE,))
+            for setting, value in differences:
+                yield from self._write_eeprom(setting, value)
             yield from self._open()
-            if switched.reply is OK:
-                log.info("adapter's auto poll was off: X1 written to its EEPROM")
-                return
-        log.info("firmware without auto poll: asking for frames with A")
-        self.polling = Polling(b"A\r", "A", POLL_INTERVAL_S)
+            auto_poll = auto_poll or (yield from self._auto_poll())
+        if not auto_poll:
+            log.info("firmware without auto poll: asking for frames with A every %g s", POLL_INTERVAL_S)
+            self.polling = Polling(b"A\r", "A", POLL_INTERVAL_S)
 
     def close_steps(self) -> Steps:
         """`C` until it is certain: the first may end a half command or meet an old answer."""
@@ -144,29 +144,55 @@ class Can232:
             f"set the bit rate ({bitrate[:-1].decode()}, {timing.description})",
             advice="this firmware may not have it: give btr0 and btr1",
         )
-        if self._stamped or self._recall("Z") == 1:
-            yield from self._write_eeprom("Z", 0, "send frames without time stamps")
-            self._stamped = False
         acceptance = self._channel.acceptance
-        if acceptance is not None:
-            yield from self._write_eeprom("W", int(acceptance.single), f"use {acceptance.mode} filter mode")
         # Always, also to pass all: the device keeps what the program before us set until power-off.
         code, mask = (acceptance.code, acceptance.mask) if acceptance else (0, 0xFFFFFFFF)
         yield self._step(f"M{code:08X}\r".encode(), f"set the acceptance code {code:#010x}")
         yield self._step(f"m{mask:08X}\r".encode(), f"set the acceptance mask {mask:#010x}")
 
+    # --- EEPROM: cells wear out and cannot be read; written only what is not known to be there --------
+
     def _recall(self, setting: str) -> int | None:
         serial = self.identity.serial_number
         return None if serial is None else self._memory.recall(serial, setting)
 
-    def _write_eeprom(self, setting: str, value: int, purpose: str) -> Steps:
-        """EEPROM cells wear out and cannot be read: write only what is not known to be there."""
-        if self._recall(setting) == value:
-            return
-        yield self._step(f"{setting}{value}\r".encode(), f"{purpose} ({setting}{value})")
-        log.info("wrote %s%d to the adapter's EEPROM", setting, value)
+    def _remember(self, setting: str, value: int) -> None:
         if self.identity.serial_number is not None:
             self._memory.remember(self.identity.serial_number, setting, value)
+
+    def _eeprom_differences(self, auto_poll: bool) -> list[tuple[str, int]]:
+        """What must be written. X is known from A, Z from frames that came, W only from what we wrote.
+
+        With X as it left the factory W is taken to be so too: whoever sets one sets the other.
+        """
+        differences = []
+        if not auto_poll and (self.identity.version or "")[1:] >= AUTO_POLL_SINCE:
+            differences.append(("X", 1))
+        if self._stamped or self._recall("Z") == 1:
+            differences.append(("Z", 0))
+        known = self._recall("W")
+        if known is None and not auto_poll:
+            known = 0
+            self._remember("W", known)
+        acceptance = self._channel.acceptance
+        if acceptance is not None and not acceptance.passes_all:
+            if known != int(acceptance.single):
+                differences.append(("W", int(acceptance.single)))
+        return differences
+
+    def _write_eeprom(self, setting: str, value: int) -> Steps:
+        """A firmware that refuses X is polled, one that refuses Z says nothing wrong; a filter must hold."""
+        purposes = {"X": "send frames by itself", "Z": "leave out time stamps", "W": "set the filter mode"}
+        accept = (OK,) if setting == "W" else (OK, REFUSED)
+        reject = tuple(reply for reply in (REFUSED, NONE) if reply not in accept)
+        request = f"{setting}{value}"
+        answer = yield self._step(f"{request}\r".encode(), f"{purposes[setting]} ({request})", accept, reject)
+        if answer.reply is OK:
+            log.info("wrote %s to the adapter's EEPROM: %s", request, purposes[setting])
+            self._remember(setting, value)
+        self._stamped = self._stamped and setting != "Z"
+
+    # --- channel ------------------------------------------------------------------------------
 
     def _open(self) -> Steps:
         if self._channel.listen_only:
@@ -197,6 +223,5 @@ class Can232:
         if self._stamped:
             return
         self._stamped = True
-        if self.identity.serial_number is not None:
-            self._memory.remember(self.identity.serial_number, "Z", 1)
+        self._remember("Z", 1)
         log.warning("adapter sends time stamps (Z1), a sixth of its line; switched off at the next start")

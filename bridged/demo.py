@@ -1,0 +1,197 @@
+"""can-bridge demo: a simulated adapter, the real bridge, and a program on the CAN interface.
+
+The simulator speaks the adapter's protocol on a pseudo terminal; the bridge does not know that it is no
+device. Where the kernel has CAN the interface is vcan0, else python-can's `virtual` inside this process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import random
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+
+from bridged.bridge import Bridge
+from bridged.config import Config, load
+from bridged.errors import BusError
+from bridged.memory import FileMemory
+from bridged.service import serve
+from bridged.simulators.can232 import Can232
+from bridged.simulators.serve import Simulator
+from bridged.simulators.uart import Uart
+
+CHANNEL = "vcan0"
+UART_RATE = 115_200
+STATUS_INTERVAL_S = 1.0
+CONFIG = """\
+adapter:
+  type: can232
+  port: {port}
+  baudrate: {baudrate}
+channel:
+  bitrate: 125000
+bus:
+  interface: {interface}
+  channel: {channel}
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `can-bridge demo`."""
+    parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="default: 10")
+    parser.add_argument("--rate", type=float, default=5.0, metavar="FPS", help="frames a second each way; default: 5")
+
+
+def candump_line(channel: str, message: can.Message) -> str:
+    """As candump prints it: `  vcan0  123   [2]  AA BB`."""
+    can_id = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+    data = "remote request" if message.is_remote_frame else " ".join(f"{byte:02X}" for byte in message.data)
+    return f"  {channel}  {can_id:>8}   [{message.dlc}]  {data}"
+
+
+class Program:
+    """What a user would run on the interface: sends frames at a steady rate and prints all that arrives."""
+
+    def __init__(self, interface: str, channel: str, rate_fps: float) -> None:
+        self.received = 0
+        self.sent = 0
+        self._channel = channel
+        self._interval_s = 1 / rate_fps
+        self._stop = threading.Event()
+        self._bus = can.Bus(interface=interface, channel=channel)
+        self._threads = [threading.Thread(target=loop) for loop in (self._receive, self._send)]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def _receive(self) -> None:
+        while not self._stop.is_set():
+            if message := self._bus.recv(0.1):
+                self.received += 1
+                print(f"{candump_line(self._channel, message)}   from the adapter", flush=True)
+
+    def _send(self) -> None:
+        rng = random.Random(1)
+        while not self._stop.wait(self._interval_s):
+            data = rng.randbytes(rng.randrange(9))
+            message = can.Message(arbitration_id=rng.randrange(0x800), is_extended_id=False, data=data)
+            self._bus.send(message)
+            self.sent += 1
+            print(f"{candump_line(self._channel, message)}   to the adapter", flush=True)
+
+    def stop(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+        self._bus.shutdown()
+
+
+@contextlib.contextmanager
+def _interface() -> Iterator[tuple[str, str]]:
+    """vcan0 if the kernel has it or can make it, else `virtual`; says which. What it made goes again."""
+    existed = Path("/sys/class/net", CHANNEL).exists()
+    try:
+        from bridged.buses.socketcan import open_socketcan  # noqa: PLC0415
+
+        open_socketcan(CHANNEL, create=True).close()
+    except BusError as error:
+        print(f"# No {CHANNEL} here: {error}")
+        print("# So the frames stay inside this process: python-can's interface 'virtual'.")
+        yield "virtual", "demo"
+        return
+    print(f"# Interface {CHANNEL}: look on from another terminal with `candump {CHANNEL}`.")
+    try:
+        yield "socketcan", CHANNEL
+    finally:
+        if not existed:
+            from bridged.buses.socketcan import delete_vcan  # noqa: PLC0415
+
+            delete_vcan(CHANNEL)
+
+
+def _load(folder: Path, simulator: Simulator, interface: str, channel: str) -> Config:
+    path = folder / "demo.yaml"
+    path.write_text(CONFIG.format(port=simulator.port, baudrate=UART_RATE, interface=interface, channel=channel))
+    return load(path)
+
+
+class _Watch(threading.Thread):
+    """Starts the program when the bridge runs, prints a status line each second, stops all in time."""
+
+    def __init__(self, bridge: Bridge, program: Program, duration_s: float) -> None:
+        super().__init__(name="watch")
+        self._bridge = bridge
+        self._program = program
+        self._duration_s = duration_s
+        self.done = threading.Event()
+
+    def run(self) -> None:
+        started = time.monotonic()
+        running = False
+        while not self.done.wait(0.02 if not running else STATUS_INTERVAL_S):
+            status = self._bridge.snapshot()
+            if not running and status["state"] == "running":
+                running = True
+                self._program.start()
+            if running:
+                print(_status_line(status), flush=True)
+            if time.monotonic() - started >= self._duration_s:
+                break
+        if running:
+            self._program.stop()
+        signal_self()
+
+
+def _status_line(status: dict[str, Any]) -> str:
+    counters = status["counters"]
+    dropped = sum(counters["tx_dropped"].values()) + sum(counters["rx_dropped"].values())
+    return (
+        f"# {status['state']}: {counters['rx_frames']} from the adapter, {counters['tx_frames']} to it, "
+        f"{status['queued']} queued, {dropped} dropped"
+    )
+
+
+def signal_self() -> None:
+    """Ends serve() as Ctrl-C would."""
+    import os  # noqa: PLC0415
+    import signal  # noqa: PLC0415
+
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def run(args: argparse.Namespace) -> int:
+    """The demo; 0 if frames went both ways."""
+    device = Can232(time.monotonic(), uart=Uart(UART_RATE))
+    simulator = Simulator(device, traffic_fps=args.rate)
+    print(f"# Simulated CAN232 on {simulator.port} at {UART_RATE} Bd, bit rate 125 kbit/s.")
+    thread = threading.Thread(target=simulator.run)
+    with tempfile.TemporaryDirectory() as folder, _interface() as (interface, channel):
+        config = _load(Path(folder), simulator, interface, channel)
+        bridge = Bridge(config, FileMemory(Path(folder)))
+        program = Program(interface, channel, args.rate)
+        watch = _Watch(bridge, program, args.duration)
+        thread.start()
+        watch.start()
+        try:
+            serve(bridge, None)
+        finally:
+            watch.done.set()
+            watch.join()
+            simulator.stop()
+            thread.join()
+    counters = bridge.snapshot()["counters"]
+    print(
+        f"# Done: {program.received} frames from the adapter seen on {channel}, {program.sent} sent to it, "
+        f"of which it confirmed {counters['tx_frames']}. Adapter closed: {device.state.value}."
+    )
+    return 0 if counters["rx_frames"] and counters["tx_frames"] else 1

@@ -1,0 +1,308 @@
+"""Bridge, relay and adapter against a simulated CAN232 on a real pty; only the CAN side is a socketpair."""
+
+import contextlib
+import logging
+import os
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridged import bridge as bridge_module
+from bridged.bridge import Bridge
+from bridged.config import load
+from bridged.lifecycle import State
+from bridged.memory import FileMemory
+from bridged.simulators.can232 import Can232
+from bridged.simulators.can232 import State as Channel
+from bridged.simulators.serve import Fault, Simulator
+from bridged.simulators.sja1000 import Frame
+
+FRAME = struct.Struct("=IB3x8s")
+LIMIT_S = 30.0
+
+
+class PairBus:
+    """A bus like socketcan's, whose other end is `far`."""
+
+    warning = ""
+    failure = None
+
+    def __init__(self) -> None:
+        self._near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._near.setblocking(False)
+        self.far.settimeout(LIMIT_S)
+        self.fd = self._near.fileno()
+        self.description = "pair"
+
+    def dropped(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        self._near.close()
+
+
+class Bench:
+    """A simulated adapter, a bridge on it, and the far end of its bus. The bridge runs in run_until()."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.link = folder / "can232"
+        self.frames: list[Frame] = []  # that the adapter put on its CAN bus
+        self.bus = PairBus()
+        monkeypatch.setattr(bridge_module, "open_bus", lambda *_args, **_options: self.bus)
+        self._simulator: Simulator | None = None
+        self._thread: threading.Thread | None = None
+
+    def plug_in(self, device: Can232, *, faults: tuple[Fault, ...] = (), traffic_fps: float = 0.0) -> None:
+        self.device = device
+        self._simulator = Simulator(
+            device, link=self.link, on_frame=self.frames.append, faults=faults, traffic_fps=traffic_fps
+        )
+        self._thread = threading.Thread(target=self._simulator.run)
+        self._thread.start()
+        while not self.link.exists():
+            os.sched_yield()
+
+    def pull_out(self) -> None:
+        if self._simulator and self._thread:
+            self._simulator.stop()
+            self._thread.join()
+            self._simulator = None
+
+    def bridge(self, channel: str = "bitrate: 125000", transmit: str = "{}", **adapter: object) -> Bridge:
+        path = self.folder / "bench.yaml"
+        options = "".join(f", {key}: {value}" for key, value in adapter.items())
+        path.write_text(
+            f"adapter: {{type: can232, port: {self.link}, baudrate: 115200{options}}}\n"
+            f"channel: {{{channel}}}\nbus: {{channel: vcan0}}\ntransmit: {transmit}\n".replace("transmit: {}\n", "")
+        )
+        return Bridge(load(path), FileMemory(self.folder / "state"))
+
+    def close(self) -> None:
+        self.pull_out()
+        self.bus.far.close()
+
+
+def run_until(bridge: Bridge, condition: Callable[[], object]) -> None:
+    """What service.serve does, until something is so."""
+    end = time.monotonic() + LIMIT_S
+    while not condition():
+        timer = bridge.next_timer()
+        wait = 0.05 if timer is None else min(0.05, max(0.0, timer - time.monotonic()))
+        if select.select(bridge.filenos(), (), (), wait)[0]:
+            bridge.on_readable()
+        bridge.on_timer(time.monotonic())
+        assert time.monotonic() < end, f"still {bridge.state}: {bridge.reason}"
+
+
+def started(bridge: Bridge, state: State = State.RUNNING) -> Bridge:
+    bridge.start()
+    run_until(bridge, lambda: bridge.state is state)
+    return bridge
+
+
+def stopped(bridge: Bridge) -> dict[str, Any]:
+    """Stops it; its last snapshot, with the books checked."""
+    bridge.stop()
+    run_until(bridge, lambda: bridge.finished)
+    bridge.close()
+    status = bridge.snapshot()
+    counters = status["counters"]
+    assert counters["bus_read"] == counters["tx_frames"] + status["queued"] + sum(counters["tx_dropped"].values())
+    assert counters["decoded"] == counters["rx_frames"] + counters["rx_pending"] + sum(
+        counters["rx_dropped"].values()
+    )
+    return status
+
+
+def type_in(device: Can232, *commands: bytes) -> None:
+    """What a program before us did."""
+    for command in commands:
+        device.host_writes(time.monotonic(), command)
+        device.advance(time.monotonic())
+    device.take_output(time.monotonic())
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    b = Bench(tmp_path, monkeypatch)
+    with contextlib.closing(b):
+        yield b
+
+
+def test_frames_both_ways_and_closed_at_the_end(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge())
+    frames = [FRAME.pack(0x100 + n, n % 9, bytes(range(n % 9))) for n in range(50)]
+    for frame in frames:
+        bench.bus.far.send(frame)
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == 50)
+    status = stopped(bridge)
+    assert [f.can_id for f in bench.frames] == [0x100 + n for n in range(50)]
+    assert bench.device.state is not Channel.OPEN
+    assert status["adapter"] | {"port": ""} == {
+        "type": "can232",
+        "port": "",
+        "version": "V1324",
+        "serial_number": "A123",
+    }
+
+
+def test_a_hundred_starts_write_the_eeprom_once(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    for _ in range(100):
+        stopped(started(bench.bridge("bitrate: 125000, acceptance: {code: 0x6000, mask: 0x1FF0}")))
+        assert bench.device.state is not Channel.OPEN
+    assert bench.device.eeprom.writes == 1
+    assert bench.frames == []
+
+
+def test_filter_mode_is_written_once_and_remembered(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    config = "bitrate: 125000, acceptance: {code: 0x6000, mask: 0x1FF0, mode: single}"
+    for _ in range(3):
+        stopped(started(bench.bridge(config)))
+    assert (bench.device.eeprom.writes, bench.device.eeprom.single_filter) == (2, 1)
+
+
+def test_time_stamps_are_switched_off_at_the_start_after_they_were_seen(bench: Bench) -> None:
+    device = Can232(time.monotonic())
+    device.eeprom.auto_poll = device.eeprom.time_stamps = True
+    bench.plug_in(device, traffic_fps=100)
+    bridge = started(bench.bridge())
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["rx_stamped"] > 3)
+    stopped(bridge)
+    assert device.eeprom.time_stamps == 1
+    stopped(started(bench.bridge()))
+    stopped(started(bench.bridge()))
+    assert (device.eeprom.time_stamps, device.eeprom.writes) == (0, 1)
+
+
+@pytest.mark.parametrize("left_over", [b"t1232AAB", b"t1232AABB", b"T1234567", b"r", b"S", b"Q", b"X"])
+def test_a_half_typed_command_of_another_program_does_nothing(bench: Bench, left_over: bytes) -> None:
+    device = Can232(time.monotonic())
+    type_in(device, b"S4\r", b"O\r", left_over)
+    assert device.state is Channel.OPEN
+    bench.plug_in(device)
+    stopped(started(bench.bridge()))
+    assert bench.frames == []
+    assert device.eeprom.writes == 1
+
+
+def test_a_device_that_starts_open_and_talking(bench: Bench) -> None:
+    device = Can232(time.monotonic())
+    type_in(device, b"S4\r", b"X1\r", b"O\r", b"Q1\r")
+    device.power_cycle(time.monotonic())
+    assert device.state is Channel.OPEN
+    bench.plug_in(device, traffic_fps=500)
+    bridge = started(bench.bridge())
+    bench.bus.far.recv(16)
+    status = stopped(bridge)
+    assert status["counters"]["rx_errors"] <= 1  # at most the line we came into the middle of
+
+
+def test_firmware_without_auto_poll_is_polled(bench: Bench) -> None:
+    device = Can232(time.monotonic(), version="V1011")
+    bench.plug_in(device, traffic_fps=200)
+    bridge = started(bench.bridge())
+    for _ in range(20):
+        bench.bus.far.recv(16)
+    bench.bus.far.send(FRAME.pack(0x7FF, 0, b""))
+    run_until(bridge, lambda: bench.frames)
+    stopped(bridge)
+    assert device.eeprom.writes == 0
+
+
+@pytest.mark.parametrize("after", range(1, 16))
+def test_stop_in_the_middle_of_initialisation_leaves_it_closed(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = bench.bridge()
+    asked = 0
+    ask = bridge._ask
+
+    def counting(*args: Any) -> None:
+        nonlocal asked
+        asked += 1
+        ask(*args)
+
+    monkeypatch.setattr(bridge, "_ask", counting)
+    bridge.start()
+    run_until(bridge, lambda: asked >= after or bridge.state is State.RUNNING)
+    stopped(bridge)
+    assert bench.device.state is not Channel.OPEN
+
+
+def test_another_serial_number_is_a_fault(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic(), serial_number="B007"))
+    bridge = started(bench.bridge(serial_number="A123"), State.FAULT)
+    assert "B007" in bridge.reason
+    assert "A123" in bridge.reason
+    stopped(bridge)
+
+
+def test_silence_is_told_then_ends(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    device = Can232(time.monotonic())
+    device.silent = True
+    bench.plug_in(device)
+    bridge = bench.bridge()
+    bridge.start()
+    run_until(bridge, lambda: bridge.state is State.CLOSING)
+    assert "no answer to V" in bridge.reason
+    device.silent = False
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    device.silent = True
+    bench.bus.far.send(FRAME.pack(1, 0, b""))
+    run_until(bridge, lambda: bridge.state is State.CLOSING)
+    assert "stopped answering" in bridge.reason
+    device.silent = False
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    assert "an answer of the adapter is missing" in caplog.text
+    stopped(bridge)
+
+
+def test_pulled_out_and_plugged_in_again(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge())
+    bench.pull_out()
+    run_until(bridge, lambda: bridge.state is State.BACKOFF)
+    assert "lost" in bridge.reason
+    bench.bus.far.send(FRAME.pack(1, 0, b""))
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["adapter-away"] == 1)
+    bench.plug_in(Can232(time.monotonic()))
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    stopped(bridge)
+    assert bench.frames == []
+
+
+def test_refused_frames_are_explained_and_sent_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    device = Can232(time.monotonic())
+    bench.plug_in(device)
+    bridge = started(bench.bridge())
+    device.refusals = 5
+    with caplog.at_level(logging.WARNING):
+        for n in range(3):
+            bench.bus.far.send(FRAME.pack(n, 0, b""))
+        run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == 3)
+        run_until(bridge, lambda: "its status" in caplog.text)
+    status = stopped(bridge)
+    assert status["counters"]["tx_retries"] == 5
+    assert [f.can_id for f in bench.frames] == [0, 1, 2]
+
+
+def test_listen_only_opens_so_and_sends_nothing(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge("bitrate: 125000, listen_only: true"))
+    assert bench.device.state is Channel.LISTEN_ONLY
+    bench.bus.far.send(FRAME.pack(1, 0, b""))
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["listen-only"] == 1)
+    stopped(bridge)
+    assert bench.frames == []
