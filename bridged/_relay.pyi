@@ -1,6 +1,6 @@
 """The data plane in C (bridged/relay): one Relay moves the frames of one bridge."""
 
-from typing import Final, Protocol
+from typing import Final, Protocol, Self
 
 class _HasFileno(Protocol):
     def fileno(self) -> int: ...
@@ -45,7 +45,7 @@ class Relay:
         answer_timeout: float,
         sync: bytes,
         sync_prefix: str,
-    ) -> Relay: ...
+    ) -> Self: ...
     def run(self) -> None:
         """Relay until stop() is called, without the GIL. OSError(EBUSY): another thread does."""
     def turn(self, now: int, /) -> int | None:

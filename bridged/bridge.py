@@ -13,7 +13,6 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from bridged import _relay
@@ -26,6 +25,8 @@ from bridged.ports import open_port
 from bridged.status import LOST_BEFORE_READ
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from bridged.adapters.base import Memory
     from bridged.buses import Bus
     from bridged.config import Config
@@ -181,7 +182,9 @@ class Bridge:
     def _on_bus_lost(self, error: int) -> None:
         if self._bus is None:
             return
-        log.error("bus lost: %s: %s; opening it again", self._bus.description, self._bus.failure or _reason(error))
+        log.error(
+            "bus lost: %s: %s; opening it again", self._bus.description, self._bus.failure or _reason(error)
+        )
         self._close_bus()
         self._bus_timer = time.monotonic()
 
@@ -322,7 +325,9 @@ class Bridge:
             self._dispatch(Event.REFUSED, f"the adapter refused to {exchange.purpose}{advice}")
         else:
             wait = f"within {exchange.timeout_s:.2g} s"
-            self._dispatch(Event.UNANSWERED, f"the adapter did not answer the request to {exchange.purpose} {wait}")
+            self._dispatch(
+                Event.UNANSWERED, f"the adapter did not answer the request to {exchange.purpose} {wait}"
+            )
 
     # --- events of the relay ------------------------------------------------------------------
 
@@ -333,7 +338,9 @@ class Bridge:
                 then(Answer(REPLIES[kind], text.decode("ascii", "replace")))
         elif kind == _relay.EVENT_PORT_LOST:
             failure = self._port.failure if self._port else None
-            self._dispatch(Event.PORT_LOST, f"port {self.config.adapter.port} lost: {failure or _reason(token)}")
+            self._dispatch(
+                Event.PORT_LOST, f"port {self.config.adapter.port} lost: {failure or _reason(token)}"
+            )
         elif kind == _relay.EVENT_SILENT:
             self._dispatch(Event.SILENT, "the adapter stopped answering")
         elif kind == _relay.EVENT_UNANSWERED:

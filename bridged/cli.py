@@ -82,7 +82,9 @@ def _status_path(args: argparse.Namespace) -> Path:
     if len(running) == 1:
         return running[0]
     names = ", ".join(path.stem for path in running)
-    raise StatusError(f"several bridges are running, name one: {names}" if running else "no bridge is running")
+    raise StatusError(
+        f"several bridges are running, name one: {names}" if running else "no bridge is running"
+    )
 
 
 def _status(args: argparse.Namespace) -> int:
@@ -104,14 +106,20 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
         return sub
 
     run = add("run", "Run the bridge of a configuration in the foreground.", _run)
-    run.add_argument("config", metavar="FILE|NAME", help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml")
+    run.add_argument(
+        "config", metavar="FILE|NAME", help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml"
+    )
     run.add_argument("--socket", type=Path, metavar="PATH", help="where the status socket is made")
-    run.add_argument("--verbose", action="store_true", help="log what is only of interest when looking for a fault")
+    run.add_argument(
+        "--verbose", action="store_true", help="log what is only of interest when looking for a fault"
+    )
 
     check = add("check", "Check a configuration; exit status 78 if it is not good.", _check)
     check.add_argument("config", metavar="FILE|NAME")
 
-    status = add("status", "Show the state and the counters of a running bridge; exit status 0 if it runs.", _status)
+    status = add(
+        "status", "Show the state and the counters of a running bridge; exit status 0 if it runs.", _status
+    )
     status.add_argument("name", nargs="?", metavar="NAME", help="stem of the configuration's file name")
     status.add_argument("--socket", metavar="PATH", help="the status socket, if not at its usual place")
     status.add_argument("--json", action="store_true")

@@ -6,21 +6,19 @@ device. Where the kernel has CAN the interface is vcan0, else python-can's `virt
 
 from __future__ import annotations
 
-import argparse
-import contextlib
+import os
 import random
-import socket
-import sys
+import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import can
 
 from bridged.bridge import Bridge
+from bridged.buses.socketcan import open_socketcan
 from bridged.config import Config, load
 from bridged.errors import BusError
 from bridged.memory import FileMemory
@@ -28,6 +26,9 @@ from bridged.service import serve
 from bridged.simulators.can232 import Can232
 from bridged.simulators.serve import Simulator
 from bridged.simulators.uart import Uart
+
+if TYPE_CHECKING:
+    import argparse
 
 CHANNEL = "vcan0"
 UART_RATE = 115_200
@@ -48,7 +49,9 @@ bus:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `can-bridge demo`."""
     parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="default: 10")
-    parser.add_argument("--rate", type=float, default=5.0, metavar="FPS", help="frames a second each way; default: 5")
+    parser.add_argument(
+        "--rate", type=float, default=5.0, metavar="FPS", help="frames a second each way; default: 5"
+    )
 
 
 def candump_line(channel: str, message: can.Message) -> str:
@@ -96,32 +99,26 @@ class Program:
         self._bus.shutdown()
 
 
-@contextlib.contextmanager
-def _interface() -> Iterator[tuple[str, str]]:
-    """vcan0 if the kernel has it or can make it, else `virtual`; says which. What it made goes again."""
-    existed = Path("/sys/class/net", CHANNEL).exists()
+def _interface() -> tuple[str, str]:
+    """python-can's interface and channel: vcan0 if the kernel has it or can make it, else `virtual`."""
+    made = not Path("/sys/class/net", CHANNEL).exists()
     try:
-        from bridged.buses.socketcan import open_socketcan  # noqa: PLC0415
-
         open_socketcan(CHANNEL, create=True).close()
     except BusError as error:
         print(f"# No {CHANNEL} here: {error}")
         print("# So the frames stay inside this process: python-can's interface 'virtual'.")
-        yield "virtual", "demo"
-        return
+        return "virtual", "demo"
     print(f"# Interface {CHANNEL}: look on from another terminal with `candump {CHANNEL}`.")
-    try:
-        yield "socketcan", CHANNEL
-    finally:
-        if not existed:
-            from bridged.buses.socketcan import delete_vcan  # noqa: PLC0415
-
-            delete_vcan(CHANNEL)
+    if made:
+        print(f"# It was made for this demo and stays: `ip link delete {CHANNEL}` removes it.")
+    return "socketcan", CHANNEL
 
 
 def _load(folder: Path, simulator: Simulator, interface: str, channel: str) -> Config:
     path = folder / "demo.yaml"
-    path.write_text(CONFIG.format(port=simulator.port, baudrate=UART_RATE, interface=interface, channel=channel))
+    path.write_text(
+        CONFIG.format(port=simulator.port, baudrate=UART_RATE, interface=interface, channel=channel)
+    )
     return load(path)
 
 
@@ -149,7 +146,7 @@ class _Watch(threading.Thread):
                 break
         if running:
             self._program.stop()
-        signal_self()
+        _end_serving()
 
 
 def _status_line(status: dict[str, Any]) -> str:
@@ -161,11 +158,8 @@ def _status_line(status: dict[str, Any]) -> str:
     )
 
 
-def signal_self() -> None:
+def _end_serving() -> None:
     """Ends serve() as Ctrl-C would."""
-    import os  # noqa: PLC0415
-    import signal  # noqa: PLC0415
-
     os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -175,7 +169,8 @@ def run(args: argparse.Namespace) -> int:
     simulator = Simulator(device, traffic_fps=args.rate)
     print(f"# Simulated CAN232 on {simulator.port} at {UART_RATE} Bd, bit rate 125 kbit/s.")
     thread = threading.Thread(target=simulator.run)
-    with tempfile.TemporaryDirectory() as folder, _interface() as (interface, channel):
+    interface, channel = _interface()
+    with tempfile.TemporaryDirectory() as folder:
         config = _load(Path(folder), simulator, interface, channel)
         bridge = Bridge(config, FileMemory(Path(folder)))
         program = Program(interface, channel, args.rate)

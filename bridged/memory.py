@@ -55,4 +55,6 @@ class FileMemory:
             fresh.write_text(json.dumps(values))
             fresh.replace(path)
         except OSError as error:
-            log.warning("cannot remember %s=%d, it will be written again at each start: %s", setting, value, error)
+            log.warning(
+                "cannot remember %s=%d, it will be written again at each start: %s", setting, value, error
+            )

@@ -9,10 +9,13 @@ import selectors
 import signal
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType
+from typing import TYPE_CHECKING
 
-from bridged.bridge import Bridge
-from bridged.status import StatusServer
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from bridged.bridge import Bridge
+    from bridged.status import StatusServer
 
 log = logging.getLogger(__name__)
 

@@ -12,11 +12,13 @@ import contextlib
 import json
 import os
 import socket
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bridged.errors import BridgeError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 ANSWER_TIMEOUT_S = 5.0
 # Reasons in tx_dropped for frames that were lost before the relay could read them.
@@ -31,7 +33,7 @@ def runtime_directory() -> Path:
     """/run/can-bridge for root, below XDG_RUNTIME_DIR for anybody else."""
     if os.geteuid() == 0:
         return Path("/run/can-bridge")
-    base = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/can-bridge-{os.geteuid()}"  # noqa: S108
+    base = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/can-bridge-{os.geteuid()}"
     return Path(base) / "can-bridge"
 
 
@@ -49,15 +51,14 @@ class StatusServer:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-            if _somebody_listens(path):
-                msg = f"a bridge named {path.stem!r} is running already (it answers on {path})"
-                raise StatusError(msg)
+            _refuse_second(path)
             path.unlink(missing_ok=True)
             self._socket.bind(str(path))
             self._socket.listen(16)
         except OSError as error:
             self._socket.close()
-            msg = f"cannot make the status socket {path}: {error.strerror or error}; --socket PATH puts it elsewhere"
+            cause = error.strerror or error
+            msg = f"cannot make the status socket {path}: {cause}; --socket PATH puts it elsewhere"
             raise StatusError(msg) from error
         except StatusError:
             self._socket.close()
@@ -85,16 +86,17 @@ class StatusServer:
         self.path.unlink(missing_ok=True)
 
 
-def _somebody_listens(path: Path) -> bool:
+def _refuse_second(path: Path) -> None:
+    """StatusError if a bridge answers there; a socket that a dead one left is no obstacle."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:
             probe.connect(str(path))
-        except TimeoutError:
-            return True
-        except OSError:
-            return False
-        return True
+        except OSError as error:
+            if not isinstance(error, TimeoutError):
+                return
+    msg = f"a bridge named {path.stem!r} is running already (it answers on {path})"
+    raise StatusError(msg)
 
 
 def query(path: Path) -> dict[str, Any]:
@@ -130,7 +132,8 @@ def render(status: dict[str, Any]) -> str:
             f"  bus         {bus['interface']} {bus['channel']}",
             f"  to bus      {counters['rx_frames']} frames, {counters['rx_errors']} errors on the line",
             f"  dropped     {_reasons(counters['rx_dropped'])}",
-            f"  to adapter  {counters['tx_frames']} frames, {counters['tx_retries']} retries, {status['queued']} queued",
+            f"  to adapter  {counters['tx_frames']} frames, {counters['tx_retries']} retries, "
+            f"{status['queued']} queued",
             f"  dropped     {_reasons(counters['tx_dropped'])}",
         ]
     )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Generator
 from typing import TYPE_CHECKING
 
 from bridged.adapters.base import Answer, Exchange, Identity, Memory, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from bridged.config import AdapterConfig, ChannelConfig
 
 log = logging.getLogger(__name__)
@@ -116,8 +117,9 @@ class Can232:
                 break
         else:
             msg = (
-                f"no answer to V on {self._port} at {self._baudrate} Bd: is the adapter powered (from the CAN side, "
-                f"6-16 V), the baud rate right (its LEDs blink it at power-on), the cable plugged?"
+                f"no answer to V on {self._port} at {self._baudrate} Bd: is the adapter powered "
+                f"(from the CAN side, 6-16 V), the baud rate right (its LEDs blink it at power-on), "
+                f"the cable plugged?"
             )
             raise AdapterError(msg)
         if not re.fullmatch("V[0-9A-F]{4}", answer.text):
@@ -175,9 +177,8 @@ class Can232:
             known = 0
             self._remember("W", known)
         acceptance = self._channel.acceptance
-        if acceptance is not None and not acceptance.passes_all:
-            if known != int(acceptance.single):
-                differences.append(("W", int(acceptance.single)))
+        if acceptance is not None and not acceptance.passes_all and known != acceptance.single:
+            differences.append(("W", int(acceptance.single)))
         return differences
 
     def _write_eeprom(self, setting: str, value: int) -> Steps:

@@ -81,7 +81,9 @@ class Bench:
         options = "".join(f", {key}: {value}" for key, value in adapter.items())
         path.write_text(
             f"adapter: {{type: can232, port: {self.link}, baudrate: 115200{options}}}\n"
-            f"channel: {{{channel}}}\nbus: {{channel: vcan0}}\ntransmit: {transmit}\n".replace("transmit: {}\n", "")
+            f"channel: {{{channel}}}\nbus: {{channel: vcan0}}\ntransmit: {transmit}\n".replace(
+                "transmit: {}\n", ""
+            )
         )
         return Bridge(load(path), FileMemory(self.folder / "state"))
 
@@ -115,7 +117,9 @@ def stopped(bridge: Bridge) -> dict[str, Any]:
     bridge.close()
     status = bridge.snapshot()
     counters = status["counters"]
-    assert counters["bus_read"] == counters["tx_frames"] + status["queued"] + sum(counters["tx_dropped"].values())
+    assert counters["bus_read"] == counters["tx_frames"] + status["queued"] + sum(
+        counters["tx_dropped"].values()
+    )
     assert counters["decoded"] == counters["rx_frames"] + counters["rx_pending"] + sum(
         counters["rx_dropped"].values()
     )

@@ -1,0 +1,134 @@
+"""CAN terms as values: bit timing and acceptance filter of an SJA1000, the controller in these adapters."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+CAN232_STANDARD_BITRATES = {
+    10_000: "S0",
+    20_000: "S1",
+    50_000: "S2",
+    100_000: "S3",
+    125_000: "S4",
+    250_000: "S5",
+    500_000: "S6",
+    800_000: "S7",
+    1_000_000: "S8",
+}
+"""bit/s → command (CAN232 manual, `Sn`). Some clones set 750 kbit/s for S7."""
+
+MAX_BITRATE = 1_000_000
+"""bit/s, the limit of classic CAN (ISO 11898-1)."""
+
+SAMPLE_POINT = 0.875
+"""Where a bit is sampled unless the user says otherwise, as a fraction of the bit time (CiA 301)."""
+
+SAMPLE_POINT_TOLERANCE = 0.05
+"""How far the sample point may be from the one that was asked for, as a fraction of the bit time."""
+
+CLOCK_HZ = 16_000_000
+"""The crystal. The controller's bit timing runs on half of it (SJA1000 data sheet 6.5.1)."""
+
+
+class BitTiming(NamedTuple):
+    """The bit rate of a channel and, where the adapter's own table is not enough, the registers that make it.
+
+    `bitrate` in bit/s, to the nearest whole one.
+    `registers` are BTR0 and BTR1; None means one of the bit rates that the adapter has a command for.
+    """
+
+    bitrate: int
+    registers: tuple[int, int] | None = None
+
+    @property
+    def description(self) -> str:
+        """`125000 bit/s`, or `125000 bit/s by BTR0 0x03, BTR1 0x1C`."""
+        if self.registers is None:
+            return f"{self.bitrate} bit/s"
+        return f"{self.bitrate} bit/s by BTR0 0x{self.registers[0]:02X}, BTR1 0x{self.registers[1]:02X}"
+
+    def can232_command(self) -> bytes:
+        r"""`S4\r` or `s031C\r` (CAN232 manual, S and s)."""
+        if self.registers is None:
+            return f"{CAN232_STANDARD_BITRATES[self.bitrate]}\r".encode()
+        return f"s{self.registers[0]:02X}{self.registers[1]:02X}\r".encode()
+
+    @classmethod
+    def from_registers(cls, btr0: int, btr1: int, clock_hz: int = CLOCK_HZ) -> BitTiming:
+        """What BTR0 = 0x03 and BTR1 = 0x1C mean: 125000 bit/s; ValueError above 1 Mbit/s."""
+        prescaler = (btr0 & 0x3F) + 1
+        quanta = 1 + ((btr1 & 0x0F) + 1) + ((btr1 >> 4 & 0x07) + 1)
+        bitrate = round(clock_hz / 2 / (prescaler * quanta))
+        if bitrate > MAX_BITRATE:
+            raise ValueError(
+                f"btr0 0x{btr0:02X} with btr1 0x{btr1:02X} makes {bitrate} bit/s; CAN ends at {MAX_BITRATE}"
+            )
+        return cls(bitrate, (btr0, btr1))
+
+
+class AcceptanceFilter(NamedTuple):
+    """Acceptance code and mask, AC0 and AM0 in the top byte; a mask bit of 1 means "don't care"."""
+
+    code: int
+    mask: int
+    single: bool = False
+
+    @property
+    def mode(self) -> str:
+        """`single`: one filter of 32 bits; `dual`: two of 16, of which either lets a frame pass."""
+        return "single" if self.single else "dual"
+
+    @property
+    def passes_all(self) -> bool:
+        """True if no frame is held back, whatever the code."""
+        return self.mask == 0xFFFFFFFF
+
+
+def require_bitrate(bitrate: int, clock_hz: int = CLOCK_HZ) -> int:
+    """Return the clock divider that makes this bit rate (bit/s); ValueError names the nearest one there is.
+
+    A divider is prescaler times quanta per bit, 1 to 32 and 8 to 25: what python-can keeps to, as what
+    ISO 11898-1 demands of any controller. A rate that is no whole number is written rounded: 83333.
+    """
+    clock = clock_hz // 2
+    dividers = {prescaler * quanta for prescaler in range(1, 33) for quanta in range(8, 26)}
+    nearest = min(dividers, key=lambda divider: abs(clock / divider - bitrate))
+    if abs(clock / nearest - bitrate) >= 1:
+        raise ValueError(
+            f"{bitrate} bit/s cannot be reached with the adapter's {clock_hz // 1_000_000} MHz clock; "
+            f"nearest is {round(clock / nearest)} bit/s; or give btr0 and btr1"
+        )
+    return nearest
+
+
+def bit_timing(bitrate: int, sample_point: float | None = None, clock_hz: int = CLOCK_HZ) -> tuple[int, int]:
+    """Return BTR0 and BTR1 for a bit rate (bit/s), exact, and a sample point (0 to 1), within 0.05.
+
+    Without a sample point the one nearest to 0.875 is taken, however near that is.
+    ValueError says what can be had instead. The arithmetic is python-can's, which costs 0.1 s to import.
+    """
+    divider = require_bitrate(bitrate, clock_hz)
+    from can import BitTiming as Calculator  # noqa: PLC0415 - see above
+
+    if not hasattr(Calculator, "iterate_from_sample_point"):
+        raise ValueError(
+            f"the bit timing for {bitrate} bit/s takes python-can 4.3 or newer; or give btr0 and btr1"
+        )
+    clock = clock_hz // 2
+    wanted = 100.0 * (SAMPLE_POINT if sample_point is None else sample_point)
+    # python-can gives one timing per prescaler, the nearest to the sample point, if the registers can hold
+    # it; its own choice among them may be 0.4 % off the bit rate. Hence: all of them, and only exact ones.
+    # It truncates the quanta per bit: a bit rate rounded up would miss, `clock // divider` does not.
+    exact = [
+        timing
+        for percent in (wanted, *range(50, 96))
+        for timing in Calculator.iterate_from_sample_point(clock, clock // divider, percent)
+        if timing.brp * timing.nbt == divider
+    ]
+    best = min(exact, key=lambda timing: (abs(timing.sample_point - wanted), timing.brp))
+    if sample_point is not None and abs(best.sample_point / 100 - sample_point) > SAMPLE_POINT_TOLERANCE:
+        raise ValueError(
+            f"{sample_point} cannot be had at {bitrate} bit/s; "
+            f"nearest is {best.sample_point / 100:.3g}; or give btr0 and btr1"
+        )
+    return best.btr0, best.btr1

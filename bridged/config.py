@@ -1,0 +1,319 @@
+"""The configuration: a YAML file becomes frozen, typed values, or a list of all that is wrong with it."""
+
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from bridged import can
+from bridged.yaml_source import (
+    Problems,
+    Section,
+    foreign_tag,
+    is_empty,
+    key_names,
+    parse,
+    quoted,
+    read_text,
+    scalar_value,
+)
+
+# --- The schema. A description completes "… is wanted, not the text 'fast'". ----------------------
+
+Flag = Annotated[bool, Meta(description="true or false")]
+Port = Annotated[
+    str, Meta(min_length=1, description="a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT")
+]
+Baudrate = Annotated[int, Meta(ge=50, le=4_000_000, description="a UART rate from 50 to 4000000 bit/s")]
+SerialNumber = Annotated[
+    str, Meta(pattern="^[!-~]{1,32}$", description="the serial number that the device reports")
+]
+Bitrate = Annotated[
+    int,
+    Meta(
+        ge=10_000,
+        le=can.MAX_BITRATE,
+        description="a bit rate from 10000 to 1000000 bit/s (a slower one by btr0 and btr1)",
+    ),
+]
+Register = Annotated[int, Meta(ge=0, le=0xFF, description="a register value from 0x00 to 0xFF")]
+SamplePoint = Annotated[
+    float, Meta(ge=0.5, le=0.95, description="a fraction of the bit time from 0.5 to 0.95")
+]
+Word = Annotated[int, Meta(ge=0, le=0xFFFFFFFF, description="a number from 0x00000000 to 0xFFFFFFFF")]
+FilterMode = Annotated[Literal["dual", "single"], Meta(description="dual or single")]
+InterfaceType = Annotated[
+    str,
+    Meta(pattern=r"^[A-Za-z0-9_.-]+$", description="socketcan or the name of another python-can interface"),
+]
+InterfaceName = Annotated[str, Meta(min_length=1, description="the name of an interface")]
+QueueLength = Annotated[int, Meta(ge=1, le=65_536, description="a number of frames from 1 to 65536")]
+Window = Annotated[int, Meta(ge=1, le=32, description="a number of unanswered frames from 1 to 32")]
+Deadline = Annotated[float, Meta(gt=0, le=3600, description="a number of seconds above 0 and up to 3600")]
+
+
+class AdapterConfig(Struct, frozen=True, kw_only=True):
+    """The device, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s."""
+
+    type: Annotated[Literal["can232"], Meta(description="can232")]
+    port: Port
+    baudrate: Baudrate = 57_600
+    serial_number: SerialNumber | None = None
+
+
+class _AcceptanceKeys(Struct, frozen=True, kw_only=True):
+    code: Word
+    mask: Word
+    mode: FilterMode = "dual"
+
+
+class _ChannelKeys(Struct, frozen=True, kw_only=True):
+    bitrate: Bitrate | None = None
+    btr0: Register | None = None
+    btr1: Register | None = None
+    sample_point: SamplePoint | None = None
+    listen_only: Flag = False
+    acceptance: _AcceptanceKeys | None = None
+
+
+class ChannelConfig(Struct, frozen=True, kw_only=True):
+    """The CAN bus behind the adapter. `acceptance` None: every frame passes."""
+
+    timing: can.BitTiming
+    listen_only: bool = False
+    acceptance: can.AcceptanceFilter | None = None
+
+
+class _BusKeys(Struct, frozen=True, kw_only=True):
+    interface: InterfaceType = "socketcan"
+    channel: InterfaceName
+    create: Flag = False
+
+
+class BusConfig(_BusKeys, frozen=True, kw_only=True):
+    """The CAN interface on the host's side; `options` go to python-can as keyword arguments."""
+
+    options: dict[str, Any] = {}
+
+
+class TransmitConfig(Struct, frozen=True, kw_only=True):
+    """How frames wait for the adapter: `queue` and `window` in frames; dropped after `deadline_s`."""
+
+    queue: QueueLength = 1024
+    window: Window = 1
+    deadline_s: Deadline = msgspec.field(default=1.0, name="deadline")
+
+
+class Config(Struct, frozen=True, kw_only=True):
+    """One bridge. `name` is the stem of the file's name."""
+
+    name: str
+    path: Path
+    adapter: AdapterConfig
+    channel: ChannelConfig
+    bus: BusConfig
+    transmit: TransmitConfig
+
+
+_SECTIONS: dict[str, type[Struct]] = {
+    "adapter": AdapterConfig,
+    "channel": _ChannelKeys,
+    "channel.acceptance": _AcceptanceKeys,
+    "bus": _BusKeys,
+    "transmit": TransmitConfig,
+}
+
+_RESERVED_OPTIONS = {
+    "bustype": "write interface",
+    "receive_own_messages": "the bridge needs it off: it would send frames back to where they came from",
+}
+"""Keyword arguments of can.Bus that are not for the user."""
+
+
+_LABEL = "[A-Za-z0-9_-]{1,63}"
+_ADDRESS = re.compile(
+    rf"(?:{_LABEL}(?:\.{_LABEL})*\.?|\[[0-9A-Fa-f:.]+(?:%[\w.-]+)?\]):([0-9]{{1,5}})/?(?:\?\S*)?", re.ASCII
+)
+"""HOST:PORT, [IPv6]:PORT, with pyserial's options: nas.local:4001, [fe80::1%eth0]:4001, h:1?logging=debug."""
+
+
+def load(path: str | os.PathLike[str]) -> Config:
+    """Return the configuration in a file; ConfigError with all problems, each with line and column."""
+    file = Path(path)
+    problems = Problems(str(path))
+    root = parse(read_text(file, problems), problems)
+    if not isinstance(root, MappingNode) or foreign_tag(root):
+        empty = root is None or is_empty(root)
+        what = "the file is empty" if empty else "the file is no mapping (a 'key: value' in each line)"
+        line, column = (0, 0) if root is None else (root.start_mark.line, root.start_mark.column)
+        problems.add(line, column, f"{what}; sections adapter, channel and bus are wanted")
+        raise problems.error()
+    config = _read_file(file, Section(root, _SECTIONS, problems))
+    if config is None:
+        raise problems.error()
+    return config
+
+
+def _read_file(path: Path, top: Section) -> Config | None:
+    top.refuse_unknown([path for path in _SECTIONS if "." not in path])
+    adapter = _read_adapter(top.section("adapter"))
+    channel_section = top.section("channel")
+    channel = _read_channel(channel_section)
+    bus = _read_bus(top.section("bus"))
+    transmit: TransmitConfig | None = TransmitConfig()
+    if "transmit" in top.nodes:
+        transmit = _read_plain(top.section("transmit", required=False), TransmitConfig)
+        if channel_section and channel_section.values.get("listen_only"):
+            top.refuse_key(
+                "transmit",
+                "nothing is sent with channel.listen_only: true; remove this section, or listen_only",
+            )
+    if top.problems or not (adapter and channel and bus and transmit):
+        return None
+    return Config(name=path.stem, path=path, adapter=adapter, channel=channel, bus=bus, transmit=transmit)
+
+
+_S = TypeVar("_S", bound=Struct)
+
+
+def _read_plain(section: Section | None, schema: type[_S]) -> _S | None:
+    """Read a section in which every key stands for itself; None, reported, if one is wrong."""
+    if section is None:
+        return None
+    values = section.read(schema)
+    complete = all(field.name in values or not field.required for field in msgspec.structs.fields(schema))
+    return schema(**values) if complete else None
+
+
+def _read_adapter(section: Section | None) -> AdapterConfig | None:
+    adapter = _read_plain(section, AdapterConfig)
+    if section and (text := _port_problem(section.values.get("port", "/"))):
+        section.refuse_value("port", text)
+    return adapter
+
+
+def _port_problem(port: str) -> str | None:
+    scheme, separator, rest = port.partition("://")
+    if not separator:
+        if port.startswith("/"):
+            return None
+        return f"a device path begins with '/', such as /dev/ttyUSB0; {quoted(port)} does not"
+    if scheme not in ("socket", "rfc2217"):
+        return f"the URL of a port begins with socket:// or rfc2217://, not {quoted(scheme + separator)}"
+    address = _ADDRESS.fullmatch(rest)
+    if not address or not 1 <= int(address[1]) <= 65_535:
+        return f"{scheme}://HOST:PORT with a PORT from 1 to 65535 is wanted, not {quoted(port)}"
+    return None
+
+
+def _read_channel(section: Section | None) -> ChannelConfig | None:
+    if section is None:
+        return None
+    values = section.read(_ChannelKeys)
+    timing = _read_timing(section)
+    acceptance = None
+    if "acceptance" in section.nodes and (
+        keys := _read_plain(section.section("acceptance", required=False), _AcceptanceKeys)
+    ):
+        acceptance = can.AcceptanceFilter(keys.code, keys.mask, single=keys.mode == "single")
+    if timing is None:
+        return None
+    return ChannelConfig(timing=timing, listen_only=values.get("listen_only", False), acceptance=acceptance)
+
+
+def _read_timing(section: Section) -> can.BitTiming | None:
+    """Make the bit timing of `bitrate` (and `sample_point`), or of `btr0` and `btr1`."""
+    registers = [key for key in ("btr0", "btr1") if key in section.nodes]
+    if "bitrate" in section.nodes:
+        if registers:
+            section.refuse_key(registers[0], "excludes bitrate; give bitrate, or btr0 and btr1")
+            return None
+        return _timing_of_bitrate(section)
+    if not registers:
+        section.refuse_missing("bitrate", "a bit rate in bit/s (or btr0 and btr1)")
+        return None
+    if "sample_point" in section.nodes:
+        section.refuse_key(
+            "sample_point", "goes with bitrate; btr0 and btr1 say already where a bit is sampled"
+        )
+    if len(registers) == 1:
+        section.refuse_key(registers[0], "is half of a pair; give both btr0 and btr1, or bitrate")
+        return None
+    try:
+        return can.BitTiming.from_registers(section.values["btr0"], section.values["btr1"])
+    except KeyError:  # reported already
+        return None
+    except ValueError as error:
+        section.refuse_value("btr0", str(error))
+        return None
+
+
+def _timing_of_bitrate(section: Section) -> can.BitTiming | None:
+    bitrate: int | None = section.values.get("bitrate")
+    sample_point: float | None = section.values.get("sample_point")
+    if bitrate is None:
+        return None
+    if bitrate in can.CAN232_STANDARD_BITRATES and sample_point is None:
+        return can.BitTiming(bitrate)
+    try:
+        can.require_bitrate(bitrate)
+    except ValueError as error:
+        section.refuse_value("bitrate", str(error))
+        return None
+    try:
+        return can.BitTiming(bitrate, can.bit_timing(bitrate, sample_point))
+    except ValueError as error:
+        section.refuse_value("bitrate" if sample_point is None else "sample_point", str(error))
+        return None
+
+
+def _read_bus(section: Section | None) -> BusConfig | None:
+    if section is None:
+        return None
+    values = section.read(_BusKeys, unknown_keys=True)
+    if "interface" in section.nodes and "interface" not in values:
+        return None
+    names = key_names(_BusKeys)
+    options = {}
+    if values.get("interface", "socketcan") == "socketcan":
+        section.refuse_unknown(names)
+        if text := _interface_name_problem(values.get("channel", "vcan0")):
+            section.refuse_value("channel", text)
+    else:
+        if values.get("create"):
+            section.refuse_value("create", "only an interface of socketcan can be created; remove it")
+        options = {key: _read_option(section, key) for key in section.nodes if key not in names}
+    return BusConfig(**values, options=options) if "channel" in values else None
+
+
+def _interface_name_problem(name: str) -> str | None:
+    """Return what the kernel would not take as the name of an interface (dev_valid_name)."""
+    if len(name.encode()) > 15:
+        return f"the name of an interface has up to 15 characters, {quoted(name)} has {len(name.encode())}"
+    if name in (".", "..") or re.search(r"[/:\s]", name):
+        return f"the name of an interface has no '/', ':' or space; {quoted(name)} is none"
+    return None
+
+
+def _read_option(section: Section, key: str) -> Any:
+    """Return an option of a python-can interface: a single value, or a list of them."""
+    if key in _RESERVED_OPTIONS:
+        section.refuse_key(key, f"cannot be given; {_RESERVED_OPTIONS[key]}")
+        return None
+    if not key.isidentifier():
+        section.refuse_key(key, "unknown key; the name of an option is wanted, such as hop_limit")
+        return None
+    node = section.nodes[key]
+    items: list[Node] = node.value if isinstance(node, SequenceNode) else [node]
+    if tag := next(filter(None, map(foreign_tag, (node, *items))), None):
+        section.refuse_value(key, f"the YAML tag {tag} means nothing here; remove it")
+        return None
+    values = [scalar_value(item) for item in items if isinstance(item, ScalarNode)]
+    if len(values) < len(items):
+        section.refuse_value(key, "a single value, or a list of single values, is wanted")
+        return None
+    return values if isinstance(node, SequenceNode) else values[0]

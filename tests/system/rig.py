@@ -1,0 +1,304 @@
+"""What system tests are built from: vcan interfaces, can-utils and can-bridge as processes, candump's logs.
+
+Nothing sleeps for luck: whatever takes time is waited for by its visible effect, with a deadline.
+Frames are strings as candump logs them and cansend takes them: ``123#1122``, ``12345678#``, ``123#R5``.
+"""
+
+import contextlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+# An emulated machine is some twenty times slower than a real one: deadlines are for what will never come.
+DEADLINE_S = 60.0
+SOCKET_BUFFER = 10_000_000
+
+T = TypeVar("T")
+
+
+def wait_until(condition: Callable[[], T], what: str, deadline_s: float = DEADLINE_S) -> T:
+    """Return the condition's first true value; after the deadline fail, naming what was waited for."""
+    end = time.monotonic() + deadline_s
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < end, f"waited {deadline_s:g} s in vain for {what}"
+        time.sleep(0.02)
+
+
+def receivers(interface: str) -> int:
+    """Count the filters by which sockets receive from the interface: zero until somebody listens."""
+    lists = Path("/proc/net/can").glob("rcvlist_*")
+    return sum(line.split()[:1] == [interface] for path in lists for line in path.read_text().splitlines())
+
+
+def mixed_frames(count: int, seed: int = 0) -> list[str]:
+    """Standard, extended and remote frames of every DLC, the same ones for the same seed."""
+    draw = random.Random(seed)
+    frames = []
+    for _ in range(count):
+        identifier = f"{draw.getrandbits(11):03X}" if draw.random() < 0.5 else f"{draw.getrandbits(29):08X}"
+        dlc = draw.randint(0, 8)
+        if draw.random() < 0.1:
+            frames.append(f"{identifier}#R{dlc or ''}")
+        else:
+            frames.append(f"{identifier}#{draw.randbytes(dlc).hex().upper()}")
+    return frames
+
+
+def assert_same_frames(received: Sequence[str], expected: Sequence[str]) -> None:
+    """Fail at the first difference. (pytest's own comparison of two long lists takes minutes.)"""
+    if list(received) == list(expected):
+        return
+    pairs = zip(received, expected, strict=False)
+    at = next((n for n, (a, b) in enumerate(pairs) if a != b), min(len(received), len(expected)))
+    near = slice(max(0, at - 2), at + 3)
+    raise AssertionError(
+        f"{len(received)} frames received, {len(expected)} expected, different from number {at} on: "
+        f"received … {' '.join(received[near])} … expected … {' '.join(expected[near])} …"
+    )
+
+
+class Process:
+    """A program running beside the test, its output in files."""
+
+    def __init__(self, arguments: Sequence[str | Path], log: Path) -> None:
+        self.arguments = [str(argument) for argument in arguments]
+        self.log = log
+        self._out, self._err = log.with_suffix(".out"), log.with_suffix(".err")
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self._popen = subprocess.Popen(self.arguments, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+        self.pid = self._popen.pid
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text(errors="replace")
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text(errors="replace")
+
+    @property
+    def status(self) -> int | None:
+        """The exit status, None while it runs."""
+        return self._popen.poll()
+
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+        """Wait for its end; the exit status."""
+        try:
+            return self._popen.wait(deadline_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {deadline_s:g} s: {self}") from None
+
+    def wait_ready(self, condition: Callable[[], T], what: str, deadline_s: float = DEADLINE_S) -> T:
+        """wait_until, but a program that ends meanwhile fails the test at once."""
+
+        def ready() -> T:
+            value = condition()
+            assert value or self.status is None, f"ended while we waited for {what}: {self}"
+            return value
+
+        return wait_until(ready, f"{what}: {self}", deadline_s)
+
+    def stop(self, with_signal: int = signal.SIGTERM, deadline_s: float = DEADLINE_S) -> int:
+        """Ask it to end, and wait for that; the exit status, negative if the signal killed it."""
+        if self.status is None:
+            self._popen.send_signal(with_signal)
+        return self.wait(deadline_s)
+
+    def kill(self) -> None:
+        if self.status is None:
+            self._popen.kill()
+            self._popen.wait()
+
+    def __str__(self) -> str:
+        return (
+            f"{' '.join(self.arguments)} (exit status {self.status})\n{self.out[-1000:]}\n{self.err[-3000:]}"
+        )
+
+
+class Candump(Process):
+    """A candump that listens already when it is made, with room for all that comes."""
+
+    def __init__(self, interface: str, log: Path, *, errors: bool = False) -> None:
+        before = receivers(interface)
+        source = f"{interface},0:0,#FFFFFFFF" if errors else interface
+        super().__init__(["candump", "-L", "-d", "-r", str(SOCKET_BUFFER), source], log)
+        self.wait_ready(lambda: receivers(interface) > before, "candump to listen")
+
+    @property
+    def count(self) -> int:
+        """How many frames there are so far."""
+        return self._out.read_bytes().count(b"\n")
+
+    @property
+    def frames(self) -> list[str]:
+        """The frames there are so far."""
+        complete = self.out.rpartition("\n")[0]
+        return [line.split()[2] for line in complete.splitlines()]
+
+    def finish(self, count: int, *, deadline_s: float = DEADLINE_S, quiet_s: float = 0.5) -> list[str]:
+        """All frames, once ``count`` have come and no more have followed for ``quiet_s``."""
+        try:
+            wait_until(lambda: self.count >= count, f"{count} frames in {self.log.name}", deadline_s)
+        except AssertionError as error:
+            raise AssertionError(f"{error}; {self.count} have come, the last {self.frames[-1:]}") from None
+        seen, since = self.count, time.monotonic()
+        while time.monotonic() - since < quiet_s:
+            time.sleep(0.05)
+            if self.count != seen:
+                seen, since = self.count, time.monotonic()
+        self.stop()
+        assert "DROPCOUNT" not in self.out + self.err, f"candump itself lost frames: {self}"
+        return self.frames
+
+
+class Bridge(Process):
+    """A running ``can-bridge run FILE --socket PATH``."""
+
+    def __init__(self, command: Sequence[str], configuration: Path, socket: Path, log: Path) -> None:
+        self._command, self._socket = command, socket
+        super().__init__([*command, "run", configuration, "--socket", socket], log)
+
+    def read_status(self) -> dict[str, Any]:
+        """What ``can-bridge status`` says, empty while there is nobody to ask."""
+        if not self._socket.exists():
+            return {}
+        asked = subprocess.run(
+            [*self._command, "status", "--socket", str(self._socket), "--json"],
+            capture_output=True,
+            text=True,
+            timeout=DEADLINE_S,
+            check=False,
+        )
+        return dict(json.loads(asked.stdout)) if asked.returncode == 0 else {}
+
+    def wait_status(
+        self, condition: Callable[[dict[str, Any]], bool], what: str, deadline_s: float = DEADLINE_S
+    ) -> dict[str, Any]:
+        """Wait until the status fulfils the condition; that status."""
+        last: dict[str, Any] = {}
+
+        def fulfilled() -> dict[str, Any]:
+            nonlocal last
+            last = self.read_status()
+            return last if last and condition(last) else {}
+
+        try:
+            return self.wait_ready(fulfilled, what, deadline_s)
+        except AssertionError as error:
+            raise AssertionError(f"{error}\nlast status: {last}") from None
+
+    def wait_state(self, state: str, deadline_s: float = DEADLINE_S) -> dict[str, Any]:
+        """Wait until the status says this state; that status."""
+        return self.wait_status(lambda status: status.get("state") == state, f"state {state}", deadline_s)
+
+    def stop_cleanly(self) -> None:
+        """SIGTERM, and exit status 0."""
+        assert self.stop() == 0, str(self)
+
+
+class Rig:
+    """Makes the parts of one test in its own directory, and clears them away afterwards."""
+
+    _interfaces_made = 0
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._processes: list[Process] = []
+        self._interfaces: list[str] = []
+        self._descriptors: list[int] = []
+        installed = shutil.which("can-bridge")
+        self.command = [installed] if installed else [sys.executable, "-m", "bridged"]
+
+    def _log(self, name: str) -> Path:
+        return self.directory / f"{len(self._processes):02}-{name}"
+
+    def vcan(self) -> str:
+        """A new vcan interface, up; its name."""
+        Rig._interfaces_made += 1
+        name = f"cbt{os.getpid() % 100000}-{Rig._interfaces_made}"
+        subprocess.run(["ip", "link", "add", "dev", name, "type", "vcan"], check=True)
+        self._interfaces.append(name)
+        subprocess.run(["ip", "link", "set", "dev", name, "up"], check=True)
+        return name
+
+    def start(self, *arguments: str | Path) -> Process:
+        """Any program, not waited for."""
+        process = Process(arguments, self._log(Path(arguments[0]).name))
+        self._processes.append(process)
+        return process
+
+    def candump(self, interface: str, *, errors: bool = False) -> Candump:
+        """A log of what appears on the interface from now on; with ``errors`` error frames too."""
+        dump = Candump(interface, self._log(f"candump-{interface}"), errors=errors)
+        self._processes.append(dump)
+        return dump
+
+    def cansend(self, interface: str, frame: str) -> None:
+        """One frame."""
+        subprocess.run(["cansend", interface, frame], check=True, timeout=DEADLINE_S)
+
+    def cangen(self, interface: str, count: int, *options: str, gap_ms: float = 0) -> Process:
+        """Generate frames, see cangen's options; it waits for room where the interface has a queue."""
+        return self.start("cangen", interface, "-g", str(gap_ms), "-n", str(count), "-p", "100", *options)
+
+    def play(self, interface: str, frames: Sequence[str], rate: float | None = None) -> Process:
+        """Send exactly these frames: as fast as it goes, or ``rate`` of them a second."""
+        log = self._log("play").with_suffix(".log")
+        step = 1 / rate if rate else 0.0
+        log.write_text("".join(f"({n * step:.6f}) {interface} {frame}\n" for n, frame in enumerate(frames)))
+        pace = ["-g", "1"] if rate else ["-t"]
+        return self.start("canplayer", "-I", log, *pace)
+
+    def slcanpty(self, interface: str) -> tuple[Process, Path]:
+        """can-utils' slcan adapter on a pseudo-terminal: the process, and the terminal a bridge opens."""
+        process = self.start("stdbuf", "-oL", "slcanpty", "/dev/ptmx", interface)
+        process.wait_ready(lambda: "/dev/pts/" in process.out, "slcanpty to name its terminal")
+        terminal = Path(re.findall(r"/dev/pts/\d+", process.out)[0])
+        # It ends when nobody has its terminal open any more.
+        self._descriptors.append(os.open(terminal, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK))
+        return process, terminal
+
+    def simulate(self, interface: str | None, *options: str, adapter: str = "can232") -> tuple[Process, Path]:
+        """A simulated adapter with its CAN side on the interface: the process, and the path of its port."""
+        link = self.directory / f"adapter{len(self._processes)}"
+        bus = ["--bus", interface] if interface else []
+        before = receivers(interface) if interface else -1
+        process = self.start(*self.command, "simulate", adapter, "--link", link, *bus, *options)
+        process.wait_ready(link.exists, "the simulated adapter's port")
+        if interface:
+            process.wait_ready(lambda: receivers(interface) > before, "the simulated adapter to listen")
+        return process, link
+
+    def bridge(self, configuration: dict[str, Any], name: str = "bridge") -> Bridge:
+        """A bridge with this configuration, not waited for."""
+        file = self.directory / f"{name}.yaml"
+        file.write_text(yaml.safe_dump(configuration, sort_keys=False))
+        bridge = Bridge(self.command, file, self.directory / f"{name}.sock", self._log(name))
+        self._processes.append(bridge)
+        return bridge
+
+    def clear(self) -> None:
+        """End and remove everything; print the logs, which pytest shows if the test has failed."""
+        for process in reversed(self._processes):
+            process.kill()
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        for interface in self._interfaces:
+            with contextlib.suppress(subprocess.CalledProcessError):
+                subprocess.run(["ip", "link", "delete", "dev", interface], check=True, capture_output=True)
+        for process in self._processes:
+            print(process)

@@ -1,0 +1,83 @@
+#!/bin/sh
+# Boots the virtual machine, runs one command in it as root with the repository in /repo, and returns its exit status.
+#
+#   run.sh [-t SECONDS] [-k DIRECTORY] [-o OVERLAY] COMMAND    COMMAND is a line for bash
+#   run.sh [-o OVERLAY] -i                                     a shell to look around in; Ctrl-D ends it
+#
+#   -t  give up after so long (1800)
+#   -k  keep here what the command left in /ctl, with journal.txt and serial.log
+#   -o  a directory laid over the guest's /
+#
+# Each boot starts from the pristine image. Status 97: the guest died; 124: time is up; otherwise the command's own.
+# Set CAN_BRIDGE_VM_ACCEL=kvm where KVM works: it is much faster, but /dev/kvm being there proves nothing.
+set -eu
+
+here=$(cd "$(dirname "$0")" && pwd)
+top=$(cd "$here/../../.." && pwd)
+limit=1800 keep='' overlay='' interactive=''
+while getopts t:k:o:i option; do
+    case $option in
+        t) limit=$OPTARG ;;
+        k) keep=$OPTARG ;;
+        o) overlay=$OPTARG ;;
+        i) interactive=1 limit=0 ;;
+        *) exit 2 ;;
+    esac
+done
+shift $((OPTIND - 1))
+[ -n "$interactive" ] || [ $# -gt 0 ] || { echo "usage: run.sh [-t SECONDS] [-k DIRECTORY] [-o OVERLAY] -i | COMMAND" >&2; exit 2; }
+
+image=$(sh "$here/build.sh" --where)
+[ -s "$image/root.ext4" ] || { echo "vm: no image yet: run build.sh first" >&2; exit 1; }
+
+ctl=$(mktemp -d "${TMPDIR:-/tmp}/can-bridge-ctl.XXXXXX")
+# shellcheck disable=SC2317  # the trap calls it
+finish() {
+    rm -f "$ctl/repo.tar" "$ctl/overlay.tar"
+    if [ -n "$keep" ]; then
+        mkdir -p "$keep"
+        cp -r "$ctl/." "$keep/"
+    fi
+    rm -rf "$ctl"
+}
+trap finish EXIT
+trap 'exit 130' INT TERM
+
+# Compiled files of the host would confuse the guest's Python.
+tar -cf "$ctl/repo.tar" -C "$top" --exclude-vcs --exclude=./.venv --exclude=./.cache --exclude=./build --exclude='./.*_cache' \
+    --exclude=.hypothesis --exclude=__pycache__ --exclude='*.so' --exclude='*.egg-info' --exclude=./tests/native/build .
+[ -z "$overlay" ] || tar -cf "$ctl/overlay.tar" -C "$overlay" .
+: > "$ctl/serial.log"
+if [ -n "$interactive" ]; then
+    : > "$ctl/interactive"
+    echo 'exec bash -i' > "$ctl/command"
+    exec 3<&0
+else
+    printf '%s\n' "$*" > "$ctl/command"
+    exec 3</dev/null
+fi
+
+case ${CAN_BRIDGE_VM_ACCEL:-tcg} in
+    tcg) set -- -accel tcg,thread=multi,tb-size=512 -cpu max,la57=off ;;
+    *) set -- -accel "$CAN_BRIDGE_VM_ACCEL" -cpu host ;;
+esac
+status=0
+timeout --foreground "$limit" qemu-system-x86_64 "$@" -smp 2 -m 2048 \
+    -nodefaults -no-user-config -display none -no-reboot \
+    -machine q35,usb=off,vmport=off,smbus=off,sata=off,i8042=off,hpet=off,graphics=off \
+    -kernel "$image/vmlinux" -initrd "$image/initrd.img" \
+    -append "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off nokaslr audit=0 tsc=reliable no_timer_check systemd.show_status=0 random.trust_cpu=on" \
+    -drive "file=$image/root.ext4,if=none,id=root,format=raw,snapshot=on,cache=unsafe" -device virtio-blk-pci,drive=root \
+    -chardev "file,id=serial,path=$ctl/serial.log" -serial chardev:serial \
+    -device virtio-serial-pci -chardev stdio,id=console,signal=off -device virtconsole,chardev=console \
+    -fsdev "local,id=ctl,path=$ctl,security_model=none" -device virtio-9p-pci,fsdev=ctl,mount_tag=ctl \
+    <&3 || status=$?
+
+if [ -s "$ctl/status" ]; then
+    status=$(cat "$ctl/status")
+else
+    [ "$status" = 124 ] || status=97
+    echo "vm: the guest did not finish (status $status); the end of its serial console:" >&2
+    tail -n 30 "$ctl/serial.log" | tr -d '\033' >&2
+fi
+exit "$status"
