@@ -6,6 +6,7 @@ does the opening of a port, which may take seconds.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import os
@@ -39,6 +40,7 @@ RECONNECT_MAXIMUM_S = 5.0
 FAULT_RETRY_S = 30.0
 BUS_RETRY_S = 1.0
 REFUSED_LOG_INTERVAL_S = 10.0
+ABORT_WAIT_S = 0.1
 
 REPLIES = {
     _relay.EVENT_OK: Reply.OK,
@@ -280,6 +282,20 @@ class Bridge:
         self._relay.set_gates(receiving=False, transmit=_relay.GATE_STOPPED)
         self._relay.stop()
         self._thread.join()
+        self.finished = True
+
+    def abort(self) -> None:
+        """For an exception that nobody expected: ends the relay, closes the channel as well as may be."""
+        self._relay.detach_port()
+        self._relay.stop()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self._port is not None:
+            with contextlib.suppress(OSError):
+                os.write(self._port.fd, 2 * next(self.adapter.close_steps()).request)
+                time.sleep(ABORT_WAIT_S)  # close() throws away what is not out yet
+            self._port.close()
+            self._port = None
         self.finished = True
 
     def close(self) -> None:

@@ -60,6 +60,9 @@ def serve(bridge: Bridge, status: StatusServer | None) -> None:
         try:
             while not bridge.finished:
                 _turn(bridge, selector)
+        except BaseException:
+            bridge.abort()
+            raise
         finally:
             bridge.close()
 

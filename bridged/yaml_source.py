@@ -195,7 +195,7 @@ def _as_number(text: str) -> str | None:
             number = float(plain)
         except ValueError:
             return None
-    if not abs(number) < 1e15:  # also NaN
+    if not (number == 0 or 1e-6 <= abs(number) < 1e15):  # NaN is neither
         return None
     if plain.lower().startswith(("0x", "0b", "0o")):
         return plain.lower() if plain[1] in "xX" else str(number)
@@ -229,9 +229,8 @@ class Section:
                 problems.add_at(key, f"{path or 'the file'}: a key is a single word")
             elif key.value in self.keys:
                 first = self.keys[key.value].start_mark.line + 1
-                self.problems.add_at(
-                    key, f"{self._below(key.value)}: given twice, first in line {first}; remove one"
-                )
+                text = f"{self._where(key.value)}: given twice, first in line {first}; remove one"
+                problems.add_at(key, text)
             else:
                 self.keys[key.value] = key
                 self.nodes[key.value] = value

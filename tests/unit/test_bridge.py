@@ -19,6 +19,7 @@ from bridged.bridge import Bridge
 from bridged.config import load
 from bridged.lifecycle import State
 from bridged.memory import FileMemory
+from bridged.service import serve
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232 import State as Channel
 from bridged.simulators.serve import Fault, Simulator
@@ -310,3 +311,26 @@ def test_listen_only_opens_so_and_sends_nothing(bench: Bench) -> None:
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["listen-only"] == 1)
     stopped(bridge)
     assert bench.frames == []
+
+
+def test_a_bug_in_the_bridge_still_ends_it_and_closes_the_channel(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = bench.bridge()
+
+    def bug(_answer: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(bridge, "_log_status", bug)
+    run = bridge._run
+
+    def run_into_it() -> None:
+        run()
+        bridge._on_frame_refused()
+
+    monkeypatch.setattr(bridge, "_run", run_into_it)
+    with pytest.raises(ZeroDivisionError):
+        serve(bridge, None)
+    while bench.device.state is not Channel.CLOSED:
+        os.sched_yield()

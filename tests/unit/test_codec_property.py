@@ -1,5 +1,6 @@
-"""The C codec against the simulator's reading of the same manual, and against every way of cutting a stream."""
+"""The C codec against the simulator's reading of the manual, and against every way of cutting a stream."""
 
+import itertools
 import struct
 
 from hypothesis import given, settings
@@ -70,7 +71,7 @@ def test_however_a_stream_is_cut_the_same_comes_out(pieces: list[bytes], data: s
     stream = b"".join(pieces)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=12)))
     edges = [0, *cuts, len(stream)]
-    parts = [stream[a:b] for a, b in zip(edges, edges[1:], strict=False)]
+    parts = [stream[a:b] for a, b in itertools.pairwise(edges)]
 
     def told(messages: list[tuple[str, bytes, int]]) -> tuple[list[tuple[str, bytes]], int]:
         skipped = sum(length for kind, _, length in messages if kind == "skipped")

@@ -1,0 +1,57 @@
+#!/bin/sh
+# Builds and runs the C unit tests with every compiler there is, under AddressSanitizer and UBSan.
+# run.sh         the tests; also that the codec compiles without a warning at -O2, and that the bench compiles
+# run.sh bench   the codec's throughput instead
+set -eu
+cd "$(dirname "$0")/../.."
+
+relay=bridged/relay
+native=tests/native
+build=$native/build
+sanitizers=-fsanitize=address,undefined
+mkdir -p "$build"
+
+# strict SOURCE: what ships must compile silently, conversions included.
+strict() {
+    "$cc" -std=c11 -O2 -Wall -Wextra -Wconversion -Werror -c "$relay/$1.c" -o "$build/$1-$cc.o"
+}
+
+# run_test NAME SOURCE...: builds test_NAME.c with these files of the relay, and runs it.
+run_test() {
+    name=test_$1
+    shift
+    sources=
+    for source; do
+        sources="$sources $relay/$source.c"
+    done
+    # shellcheck disable=SC2086 # names without spaces, to be split
+    "$cc" -std=c11 -g -O1 -Wall -Wextra -Werror $sanitizers -fno-sanitize-recover=all \
+        "$native/$name.c" $sources -o "$build/$name-$cc"
+    printf '%s (%s): ' "$name" "$cc"
+    "$build/$name-$cc" || failed=1
+}
+
+bench() {
+    "$cc" -std=c11 -O2 -Wall -Wextra -Werror "$native/bench_codec.c" "$relay/codec_can232.c" -o "$build/bench_codec-$cc"
+}
+
+failed=0
+compilers=0
+for cc in gcc clang; do
+    command -v "$cc" >/dev/null || continue
+    compilers=$((compilers + 1))
+    bench
+    if [ "${1-}" = bench ]; then
+        echo "$cc"
+        "$build/bench_codec-$cc"
+        continue
+    fi
+    strict codec_can232
+    run_test codec_can232 codec_can232
+    run_test codec_can232_streams codec_can232
+done
+if [ "$compilers" = 0 ]; then
+    echo "run.sh: neither gcc nor clang found" >&2
+    exit 1
+fi
+exit "$failed"

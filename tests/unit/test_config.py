@@ -1,0 +1,482 @@
+"""bridged.config: what loads, and for what does not, the exact list of problems."""
+# ruff: noqa: E501 - in the tables, a message is one line as the user sees it
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import msgspec
+import pytest
+
+from bridged import config
+from bridged.can import AcceptanceFilter, BitTiming
+from bridged.config import AdapterConfig, BusConfig, ChannelConfig, TransmitConfig, load
+from bridged.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+with warnings.catch_warnings(action="ignore"):  # python-can 4.1 on Python 3.11
+    import can as python_can
+
+REPOSITORY = Path(__file__).parents[2]
+EXAMPLES = sorted((REPOSITORY / "config").glob("*.yaml"))
+
+ISSUE = """\
+adapter:
+  type: can232
+  port: /dev/ttyUSB0
+  baudrate: 57600
+  serial_number: A123
+channel:
+  bitrate: 125000
+  listen_only: false
+  acceptance: {code: 0x00006000, mask: 0x00001FF0, mode: dual}
+bus:
+  interface: socketcan
+  channel: vcan0
+  create: true
+transmit: {queue: 1024, window: 1, deadline: 1.0}
+"""
+
+needs_calculator = pytest.mark.skipif(
+    not hasattr(python_can.BitTiming, "iterate_from_sample_point"), reason="python-can older than 4.3"
+)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "test.yaml"
+
+
+def four_lines(
+    adapter: str = "{type: can232, port: /dev/ttyUSB0}",
+    channel: str = "{bitrate: 125000}",
+    bus: str = "{channel: vcan0}",
+    more: str = "",
+) -> str:
+    """A file with a section in each line; their values begin in columns 10, 10, 6 and 11 (transmit)."""
+    return f"adapter: {adapter}\nchannel: {channel}\nbus: {bus}\n{more}\n"
+
+
+def adapter(extra: str) -> str:
+    return four_lines(f"{{type: can232, port: /dev/x, {extra}}}")
+
+
+def port(text: str) -> str:
+    return four_lines(f"{{type: can232, port: {text}}}")
+
+
+def channel(keys: str) -> str:
+    return four_lines(channel=f"{{{keys}}}")
+
+
+def bus(keys: str) -> str:
+    return four_lines(bus=f"{{{keys}}}")
+
+
+def transmit(keys: str) -> str:
+    return four_lines(more=f"transmit: {{{keys}}}")
+
+
+def problems_of(file: Path, content: str | bytes) -> list[str]:
+    """The problems of a file, without its name; none if it loads."""
+    file.write_bytes(content.encode() if isinstance(content, str) else content)
+    problems = []
+    try:
+        load(file)
+    except ConfigError as error:
+        problems = error.problems
+    assert all(problem.startswith(f"{file}:") for problem in problems)
+    return [problem.removeprefix(f"{file}:") for problem in problems]
+
+
+# --- What loads ------------------------------------------------------------------------------------
+
+
+def test_the_whole_schema(file: Path) -> None:
+    file.write_text(ISSUE)
+    loaded = load(str(file))
+    assert loaded == config.Config(
+        name="test",
+        path=file,
+        adapter=AdapterConfig(type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number="A123"),
+        channel=ChannelConfig(
+            timing=BitTiming(125_000), listen_only=False, acceptance=AcceptanceFilter(0x6000, 0x1FF0, False)
+        ),
+        bus=BusConfig(interface="socketcan", channel="vcan0", create=True, options={}),
+        transmit=TransmitConfig(queue=1024, window=1, deadline_s=1.0),
+    )
+    with pytest.raises(AttributeError):
+        loaded.adapter.port = "/dev/null"  # type: ignore[misc]
+
+
+def test_defaults(file: Path) -> None:
+    file.write_text(four_lines())
+    loaded = load(file)
+    assert loaded.adapter == AdapterConfig(
+        type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number=None
+    )
+    assert loaded.channel == ChannelConfig(timing=BitTiming(125_000), listen_only=False, acceptance=None)
+    assert loaded.bus == BusConfig(interface="socketcan", channel="vcan0", create=False, options={})
+    assert loaded.transmit == TransmitConfig(queue=1024, window=1, deadline_s=1.0)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
+def test_examples_load(example: Path) -> None:
+    assert load(example).name == example.stem
+
+
+def test_there_are_examples() -> None:
+    assert len(EXAMPLES) >= 4
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "value"),
+    [
+        (adapter("serial_number: 0123"), "adapter.serial_number", "0123"),
+        (adapter("serial_number: 1E5"), "adapter.serial_number", "1E5"),
+        (adapter("serial_number: 1.0E+5"), "adapter.serial_number", "1.0E+5"),
+        (adapter("serial_number: 12:30"), "adapter.serial_number", "12:30"),
+        (adapter("serial_number: no"), "adapter.serial_number", "no"),
+        (adapter("serial_number: 2026-01-02"), "adapter.serial_number", "2026-01-02"),
+        (adapter("baudrate: 115_200"), "adapter.baudrate", 115_200),
+        (adapter("baudrate: !!int 9600"), "adapter.baudrate", 9600),
+        (port("'socket://[::1]:4001'"), "adapter.port", "socket://[::1]:4001"),
+        (port("'rfc2217://nas.local:1?timeout=3'"), "adapter.port", "rfc2217://nas.local:1?timeout=3"),
+        (channel("bitrate: 800000"), "channel.timing", BitTiming(800_000)),
+        (channel("btr0: 0x03, btr1: 28"), "channel.timing", BitTiming(125_000, (0x03, 0x1C))),
+        (channel("btr0: 0b11, btr1: 0x1c"), "channel.timing", BitTiming(125_000, (0x03, 0x1C))),
+        (channel("btr0: 0x3F, btr1: 0x7F"), "channel.timing", BitTiming(5_000, (0x3F, 0x7F))),
+        (channel("btr0: &r 0x14, btr1: *r"), "channel.timing", BitTiming(47_619, (0x14, 0x14))),
+        (channel("bitrate: 10000, listen_only: yes"), "channel.listen_only", True),
+        (channel("bitrate: 10000, listen_only: Off"), "channel.listen_only", False),
+        (channel("bitrate: 10000, acceptance: {code: 0, mask: 0xFFFFFFFF, mode: single}"), "channel.acceptance", AcceptanceFilter(0, 0xFFFFFFFF, single=True)),
+        (bus("channel: 0"), "bus.channel", "0"),
+        (bus("channel: a23456789012345"), "bus.channel", "a23456789012345"),
+        (bus("interface: virtual, channel: a/b c d e f g h i"), "bus.channel", "a/b c d e f g h i"),
+        (bus("interface: virtual, channel: x, create: false"), "bus.create", False),
+        (bus("interface: pcan, channel: x, a: 1, b: 0.5, c: yes, d: e f, g: [1, x], h: ~, i: []"), "bus.options", {"a": 1, "b": 0.5, "c": True, "d": "e f", "g": [1, "x"], "h": None, "i": []}),
+        (transmit("deadline: 1"), "transmit.deadline_s", 1.0),
+        (transmit("deadline: 3600, window: 32"), "transmit.window", 32),
+        (transmit(""), "transmit.queue", 1024),
+        ("\ufeff" + four_lines(), "name", "test"),
+        (four_lines().replace("\n", "\r\n"), "adapter.port", "/dev/ttyUSB0"),
+        ("%YAML 1.1\n---\n" + four_lines(), "name", "test"),
+    ],
+)  # fmt: skip
+def test_values(file: Path, text: str, path: str, value: object) -> None:
+    file.write_bytes(text.encode())
+    found: Any = load(file)
+    for name in path.split("."):
+        found = getattr(found, name)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@needs_calculator
+@pytest.mark.parametrize(
+    ("channel", "timing"),
+    [
+        ("{bitrate: 83333}", BitTiming(83_333, (0x45, 0x1C))),
+        ("{bitrate: 125000, sample_point: 0.75}", BitTiming(125_000, (0xC3, 0x3A))),
+        ("{bitrate: 125000, sample_point: 0.875}", BitTiming(125_000, (0x43, 0x1C))),
+    ],
+)
+def test_bit_timing_by_python_can(file: Path, channel: str, timing: BitTiming) -> None:
+    file.write_text(four_lines(channel=channel))
+    assert load(file).channel.timing == timing
+
+
+# --- What does not ---------------------------------------------------------------------------------
+
+PORT = "a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT is wanted"
+URL = "HOST:PORT with a PORT from 1 to 65535 is wanted, not"
+BAUDRATE = "a UART rate from 50 to 4000000 bit/s is wanted"
+BITRATE = "a bit rate from 10000 to 1000000 bit/s (a slower one by btr0 and btr1) is wanted"
+REGISTER = "a register value from 0x00 to 0xFF is wanted"
+SAMPLE_POINT = "a fraction of the bit time from 0.5 to 0.95 is wanted"
+WORD = "a number from 0x00000000 to 0xFFFFFFFF is wanted"
+NAME = "the name of an interface has"
+DEADLINE = "a number of seconds above 0 and up to 3600 is wanted"
+SINGLE = "a single value, or a list of single values, is wanted"
+
+
+@pytest.mark.parametrize(
+    ("section", "entry", "problem"),
+    [
+        (port, "ttyUSB0", "a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not"),
+        (port, "3", "a device path begins with '/', such as /dev/ttyUSB0; '3' does not"),
+        (port, "''", f"{PORT}, not the text ''"),
+        (port, "{a: b}", f"{PORT}, not a mapping"),
+        (port, '"/dev/\\0"', f"{PORT}, without unprintable characters"),
+        (port, '"/dev/\\ud800"', f"{PORT}, without unprintable characters"),
+        (port, "loop://", "the URL of a port begins with socket:// or rfc2217://, not 'loop://'"),
+        (port, "socket://host", f"socket://{URL} 'socket://host'"),
+        (port, "socket://host:0", f"socket://{URL} 'socket://host:0'"),
+        (port, "rfc2217://host:65536", f"rfc2217://{URL} 'rfc2217://host:65536'"),
+        (port, "socket://:4001", f"socket://{URL} 'socket://:4001'"),
+        (port, "socket://a..b:1", f"socket://{URL} 'socket://a..b:1'"),
+        (port, "socket://größe:1", f"socket://{URL} 'socket://größe:1'"),
+        (adapter, "baudrate: fast", f"{BAUDRATE}, not the text 'fast'"),
+        (adapter, "baudrate: 1e6", f"{BAUDRATE}, not the text '1e6' (write 1000000)"),
+        (adapter, "baudrate: '57600'", f"{BAUDRATE}, not the text '57600' (write 57600, without quotes)"),
+        (adapter, "baudrate: !!str 9600", f"{BAUDRATE}, not the text '9600' (write 9600)"),
+        (adapter, "baudrate: 057600", f"{BAUDRATE}, not the text '057600' (write 57600)"),
+        (adapter, "baudrate: 0o17", f"{BAUDRATE}, not the text '0o17' (write 15)"),
+        (adapter, "baudrate: 12:30", f"{BAUDRATE}, not the text '12:30'"),
+        (adapter, "baudrate: 57600.0", f"{BAUDRATE}, not 57600.0"),
+        (adapter, "baudrate: yes", f"{BAUDRATE}, not the yes-or-no value 'yes'"),
+        (adapter, "baudrate: 2026-01-02", f"{BAUDRATE}, not the text '2026-01-02'"),
+        (adapter, "baudrate: 49", f"{BAUDRATE}, not 49"),
+        (adapter, "baudrate: -9600", f"{BAUDRATE}, not -9600"),
+        (adapter, "baudrate: 1" + "0" * 50, f"{BAUDRATE}, not 1{'0' * 39}…"),
+        (adapter, "baudrate: " + "9" * 5000, f"{BAUDRATE}, not the text '{'9' * 40}…'"),
+        (adapter, "baudrate: !!int x", f"{BAUDRATE}, not the text 'x'"),
+        (adapter, "baudrate: !!bool x", f"{BAUDRATE}, not the text 'x'"),
+        (adapter, "baudrate: !!binary aGk=", "the YAML tag '!!binary' means nothing here; remove it"),
+        (adapter, "baudrate: null", f"is empty; {BAUDRATE}, or remove the key"),
+        (adapter, "serial_number: A 1", "the serial number that the device reports is wanted, not the text 'A 1'"),
+        (channel, "bitrate: 123456", "123456 bit/s cannot be reached with the adapter's 16 MHz clock; nearest is 123077 bit/s; or give btr0 and btr1"),
+        (channel, "bitrate: 2000000", f"{BITRATE}, not 2000000"),
+        (channel, "bitrate: 5000", f"{BITRATE}, not 5000"),
+        (channel, "bitrate: 125k", f"{BITRATE}, not the text '125k'"),
+        (channel, "btr1: 0x11, btr0: 0", "btr0 0x00 with btr1 0x11 makes 1600000 bit/s; CAN ends at 1000000"),
+        (channel, "btr1: 0x1C, btr0: 0x100", f"{REGISTER}, not 0x100"),
+        (channel, "btr0: 0x03, btr1: 1C", f"{REGISTER}, not the text '1C'"),
+        (channel, "bitrate: 125000, sample_point: 87.5", f"{SAMPLE_POINT}, not 87.5"),
+        (channel, "bitrate: 125000, sample_point: .nan", f"{SAMPLE_POINT}, not the text '.nan'"),
+        (channel, "bitrate: 125000, listen_only: 1", "true or false is wanted, not 1"),
+        (channel, "bitrate: 125000, acceptance: 3", "a section with code, mask, mode is wanted, not 3"),
+        (bus, "channel: a234567890123456", f"{NAME} up to 15 characters, 'a234567890123456' has 16"),
+        (bus, "channel: größe-größe-1", f"{NAME} up to 15 characters, 'größe-größe-1' has 17"),
+        (bus, "channel: /dev/can", f"{NAME} no '/', ':' or space; '/dev/can' is none"),
+        (bus, "channel: ..", f"{NAME} no '/', ':' or space; '..' is none"),
+        (bus, "channel: x, interface: a b", "socketcan or the name of another python-can interface is wanted, not the text 'a b'"),
+        (bus, "interface: virtual, channel: x, create: yes", "only an interface of socketcan can be created; remove it"),
+        (transmit, "window: 33", "a number of unanswered frames from 1 to 32 is wanted, not 33"),
+        (transmit, "deadline: 0", f"{DEADLINE}, not 0"),
+        (transmit, "deadline: .inf", f"{DEADLINE}, not the text '.inf'"),
+        (transmit, "deadline: 1e-1", f"{DEADLINE}, not the text '1e-1' (write 0.1)"),
+        (transmit, "deadline: 1e-9", f"{DEADLINE}, not the text '1e-9'"),
+        (transmit, "deadline: 1:30.5", f"{DEADLINE}, not the text '1:30.5'"),
+    ],
+)  # fmt: skip
+def test_one_wrong_value(file: Path, section: Callable[[str], str], entry: str, problem: str) -> None:
+    """The last value of the entry is wrong, and only that."""
+    text = section(entry)
+    path = f"adapter.port: {entry}" if section is port else f"{section.__name__}.{entry.rpartition(', ')[2]}"
+    key, value = path.split(": ", 1)
+    line = next(number for number, line in enumerate(text.splitlines()) if entry in line)
+    column = text.splitlines()[line].rindex(value)
+    assert problems_of(file, text) == [f"{line + 1}:{column + 1}: {key}: {problem}"]
+
+
+ADAPTER_KEYS = "type, port, baudrate, serial_number"
+CHANNEL_KEYS = "bitrate, btr0, btr1, sample_point, listen_only, acceptance"
+BUS_KEYS = "interface, channel, create"
+SECTIONS = "sections adapter, channel and bus are wanted"
+NO_MAPPING = f"the file is no mapping (a 'key: value' in each line); {SECTIONS}"
+
+CASES: dict[str, tuple[str | bytes, list[str]]] = {
+    # the file
+    "empty": ("", [f"1:1: the file is empty; {SECTIONS}"]),
+    "comment": ("# nothing\n", [f"1:1: the file is empty; {SECTIONS}"]),
+    "null": ("\n---\n", [f"3:1: the file is empty; {SECTIONS}"]),
+    "list": ("\n- a\n", [f"2:1: {NO_MAPPING}"]),
+    "text": ("hello", [f"1:1: {NO_MAPPING}"]),
+    "tagged": ("!!set {a, b}", [f"1:1: {NO_MAPPING}"]),
+    "no sections": ("{}", [
+        f"1:1: adapter: is missing; a section with {ADAPTER_KEYS} is wanted",
+        f"1:1: channel: is missing; a section with {CHANNEL_KEYS} is wanted",
+        f"1:1: bus: is missing; a section with {BUS_KEYS} is wanted",
+    ]),
+    "sections that are none": ("adapter: can232\nchannel: [1]\nbus:\ntransmit: ~\n", [
+        f"1:10: adapter: a section with {ADAPTER_KEYS} is wanted, not the text 'can232'",
+        f"2:10: channel: a section with {CHANNEL_KEYS} is wanted, not a list",
+        f"3:5: bus: is empty; a section with {BUS_KEYS} is wanted",
+        "4:11: transmit: is empty; a section with queue, window, deadline is wanted, or remove the key",
+    ]),
+    "empty sections": ("adapter: {}\nchannel: {}\nbus: {}\n", [
+        "1:1: adapter.type: is missing; can232 is wanted",
+        f"1:1: adapter.port: is missing; {PORT}",
+        "2:1: channel.bitrate: is missing; a bit rate in bit/s (or btr0 and btr1) is wanted",
+        "3:1: bus.channel: is missing; the name of an interface is wanted",
+    ]),
+    # keys
+    "unknown": ("adapter:\n  type: can232\n  port: /dev/x\n  baud: 1\nchannel: {bitrate: 125000}\nbus: {channel: vcan0, loop: true}\ntransmitt: {}\n1: 2\n", [
+        f"4:3: adapter.baud: unknown key, baudrate is probably meant; allowed here: {ADAPTER_KEYS}",
+        f"6:23: bus.loop: unknown key; allowed here: {BUS_KEYS}",
+        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit",
+        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit",
+    ]),
+    "in the wrong section": ("adapter: {type: can232, port: /dev/x, bitrate: 1, channel: a}\nchannel: {bitrate: 125000, mask: 1}\nbus: {channel: vcan0}\nport: /dev/x\n", [
+        f"1:39: adapter.bitrate: unknown key, it belongs to channel; allowed here: {ADAPTER_KEYS}",
+        f"1:51: adapter.channel: unknown key, it belongs to bus; allowed here: {ADAPTER_KEYS}",
+        f"2:28: channel.mask: unknown key, it belongs to channel.acceptance; allowed here: {CHANNEL_KEYS}",
+        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit",
+    ]),
+    "hyphen, capitals": (channel("bitrate: 125000, listen-only: true, BTR0: 3"), [
+        f"2:28: channel.listen-only: unknown key, listen_only is probably meant; allowed here: {CHANNEL_KEYS}",
+        f"2:47: channel.BTR0: unknown key, btr0 is probably meant; allowed here: {CHANNEL_KEYS}",
+    ]),
+    "odd keys": (bus("channel: vcan0, ? [a] : 1, ? {b: c} : 2, 'a b': 3, \"\\n\": 4, " + "x" * 50 + ": 5"), [
+        "3:25: bus: a key is a single word",
+        "3:36: bus: a key is a single word",
+        f"3:48: bus.'a b': unknown key; allowed here: {BUS_KEYS}",
+        f"3:58: bus.'\\n': unknown key; allowed here: {BUS_KEYS}",
+        f"3:67: bus.'{'x' * 40}…': unknown key; allowed here: {BUS_KEYS}",
+    ]),
+    "merge key": ("adapter: &a {type: can232, port: /dev/x}\nchannel: {bitrate: 125000}\nbus: {<<: *a, channel: vcan0}\n", [
+        f"3:7: bus.'<<': unknown key; allowed here: {BUS_KEYS}",
+    ]),
+    "twice": ("adapter: {type: can232, port: /dev/x}\nchannel:\n  bitrate: 125000\n  bitrate: fast\nbus: {channel: vcan0}\nadapter: 1\n", [
+        "4:3: channel.bitrate: given twice, first in line 3; remove one",
+        "6:1: adapter: given twice, first in line 1; remove one",
+    ]),
+    "odd and twice": (bus('channel: x, "\\n": 1, "\\n": 2'), [
+        f"3:19: bus.'\\n': unknown key; allowed here: {BUS_KEYS}",
+        "3:28: bus.'\\n': given twice, first in line 3; remove one",
+    ]),
+    # combinations
+    "several in a section": (four_lines("{type: can231, port: ttyUSB0, baudrate: 1.5}"), [
+        "1:17: adapter.type: can232 is wanted, not the text 'can231'",
+        "1:31: adapter.port: a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not",
+        f"1:50: adapter.baudrate: {BAUDRATE}, not 1.5",
+    ]),
+    "bitrate and btr": (channel("bitrate: 125000, btr1: 0x1C, btr0: 0x03"), ["2:40: channel.btr0: excludes bitrate; give bitrate, or btr0 and btr1"]),
+    "half a pair": (channel("btr1: 3"), ["2:11: channel.btr1: is half of a pair; give both btr0 and btr1, or bitrate"]),
+    "sample point and btr": (channel("btr0: 3, btr1: 28, sample_point: 0.8"), [
+        "2:30: channel.sample_point: goes with bitrate; btr0 and btr1 say already where a bit is sampled",
+    ]),
+    "acceptance": (channel("bitrate: 125000, acceptance: {code: 0x100000000, mode: both, x: 1}"), [
+        f"2:28: channel.acceptance.mask: is missing; {WORD}",
+        f"2:47: channel.acceptance.code: {WORD}, not 0x100000000",
+        "2:66: channel.acceptance.mode: dual or single is wanted, not the text 'both'",
+        "2:72: channel.acceptance.x: unknown key; allowed here: code, mask, mode",
+    ]),
+    "acceptance, signs and quotes": (channel("bitrate: 125000, acceptance: {code: -1, mask: '0x1FF0'}"), [
+        f"2:47: channel.acceptance.code: {WORD}, not -1",
+        f"2:57: channel.acceptance.mask: {WORD}, not the text '0x1FF0' (write 0x1ff0, without quotes)",
+    ]),
+    "transmit when listening": (four_lines(channel="{bitrate: 125000, listen_only: true}", more="transmit: {queue: 0}"), [
+        "4:1: transmit: nothing is sent with channel.listen_only: true; remove this section, or listen_only",
+        "4:19: transmit.queue: a number of frames from 1 to 65536 is wanted, not 0",
+    ]),
+    "options": (bus("interface: virtual, channel: x, a: {b: c}, d: [[]], e: &e [*e], f-g: 1, bustype: x, h: !x 1, i: [!y z]"), [
+        f"3:42: bus.a: {SINGLE}",
+        f"3:53: bus.d: {SINGLE}",
+        f"3:62: bus.e: {SINGLE}",
+        "3:71: bus.f-g: unknown key; the name of an option is wanted, such as hop_limit",
+        "3:79: bus.bustype: cannot be given; write interface",
+        "3:94: bus.h: the YAML tag '!x' means nothing here; remove it",
+        "3:103: bus.i: the YAML tag '!y' means nothing here; remove it",
+    ]),
+    "echo": (bus("interface: virtual, channel: x, receive_own_messages: true"), [
+        "3:39: bus.receive_own_messages: cannot be given; the bridge needs it off: it would send frames back to where they came from",
+    ]),
+    "tags": ("adapter: !!python/object:os.system {type: can232}\nchannel: {bitrate: !!python/name:os.system '', btr0: !foo 3}\nbus: {!!python/name:a b: 1, channel: x}\n", [
+        "1:10: adapter: the YAML tag '!!python/object:os.system' means nothing here; remove it",
+        "2:20: channel.bitrate: the YAML tag '!!python/name:os.system' means nothing here; remove it",
+        "2:48: channel.btr0: excludes bitrate; give bitrate, or btr0 and btr1",
+        "2:54: channel.btr0: the YAML tag '!foo' means nothing here; remove it",
+        "3:7: bus: a key is a single word",
+    ]),
+    "recursive": ("&r {adapter: {type: can232, port: *r}, channel: {bitrate: 125000}, bus: *r}", [
+        f"1:1: adapter.port: {PORT}, not a mapping",
+        f"1:5: bus.adapter: unknown key; allowed here: {BUS_KEYS}",
+        "1:49: bus.channel: the name of an interface is wanted, not a mapping",
+        f"1:68: bus.bus: unknown key; allowed here: {BUS_KEYS}",
+    ]),
+    # YAML
+    "tab": ("adapter:\n\ttype: can232\n", ["2:1: not valid YAML: indent with spaces, not with tabs (found character '\\t' that cannot start any token)"]),
+    "indentation": ("adapter:\n  type: can232\n port: x\n", [
+        "3:2: not valid YAML: the indentation does not fit the lines above (expected <block end>, but found '<block mapping start>')",
+    ]),
+    "colons": ("adapter: type: can232\n", ["1:14: not valid YAML: there is a ':' too many, or the indentation is wrong (mapping values are not allowed here)"]),
+    "no colon": ("adapter: {}\nchannel\nbus: {}\n", ["3:1: not valid YAML: a key lacks its ':' and a space (could not find expected ':')"]),
+    "two documents": ("a: b\n---\nc: d\n", ["2:1: not valid YAML: a file holds one configuration, so no second '---' (but found another document)"]),
+    "alias": ("a: *b\n", ["1:4: not valid YAML: a value that begins with '*' is written in quotes (found undefined alias 'b')"]),
+    "unclosed": ("adapter: {type: can232\n", ["2:1: not valid YAML: expected ',' or '}', but got '<stream end>'"]),
+    "escape": ('a: "\\UFFFFFFFF"\n', ["1:7: not valid YAML: a number is out of range"]),
+    "control character": ("a: 1\nb: \x07\n", ["2:4: not valid YAML: character U+0007 is not allowed"]),
+    "latin-1": (b"a: 1\nb: gr\xf6\xdfe\n", ["2:6: byte 0xF6 is not UTF-8; save the file as UTF-8"]),
+    "utf-16": ("a: b".encode("utf-16"), ["1:1: byte 0xFF is not UTF-8; save the file as UTF-8"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "expected"), CASES.values(), ids=CASES.keys())
+def test_problems(file: Path, content: str | bytes, expected: list[str]) -> None:
+    assert problems_of(file, content) == expected
+
+
+def test_nested_too_deeply(file: Path) -> None:
+    [problem] = problems_of(file, "a: " + "[" * 60_000)
+    assert re.fullmatch(r"1:\d+: not valid YAML: nested too deeply", problem)
+
+
+@needs_calculator
+def test_sample_point_out_of_reach(file: Path) -> None:
+    assert problems_of(file, channel("bitrate: 320000, sample_point: 0.9")) == [
+        "2:42: channel.sample_point: 0.9 cannot be had at 320000 bit/s; nearest is 0.68; or give btr0 and btr1"
+    ]
+
+
+def test_python_can_too_old(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Debian 12 has python-can 4.1: the bit rates of the S command work, others say what is missing."""
+    monkeypatch.delattr(python_can.BitTiming, "iterate_from_sample_point", raising=False)
+    assert problems_of(file, channel("bitrate: 125000")) == []
+    assert problems_of(file, channel("bitrate: 83333")) == [
+        "2:20: channel.bitrate: the bit timing for 83333 bit/s takes python-can 4.3 or newer; "
+        "or give btr0 and btr1"
+    ]
+    assert problems_of(file, channel("bitrate: 125000, sample_point: 0.8")) == [
+        "2:42: channel.sample_point: the bit timing for 125000 bit/s takes python-can 4.3 or newer; "
+        "or give btr0 and btr1"
+    ]
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    missing, large = tmp_path / "missing.yaml", tmp_path / "large.yaml"
+    large.write_bytes(b"#" * 65_537)
+    for path, text in [
+        (missing, "cannot be read: No such file or directory"),
+        (tmp_path, "cannot be read: Is a directory"),
+        (large, "is larger than 65536 bytes: not a configuration"),
+        (Path("/dev/zero"), "is larger than 65536 bytes: not a configuration"),
+    ]:
+        with pytest.raises(ConfigError) as caught:
+            load(path)
+        assert caught.value.problems == [f"{path}: {text}"]
+        assert str(caught.value) == f"{path}: {text}"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_a_file_without_permission(file: Path) -> None:
+    file.touch(mode=0)
+    with pytest.raises(ConfigError, match="cannot be read: Permission denied"):
+        load(file)
+
+
+def test_every_value_has_a_description() -> None:
+    """read() needs one; only a section has none."""
+    for schema in config._SECTIONS.values():
+        for field in msgspec.structs.fields(schema):
+            parts = [field.type, *get_args(field.type)]
+            described = any(getattr(part, "__metadata__", None) for part in parts)
+            assert described or config._AcceptanceKeys in parts, f"{schema.__name__}.{field.name}"
+
+
+def test_a_right_file_is_cheap() -> None:
+    code = (
+        "import sys; from bridged.config import load; load(sys.argv[1]);"
+        "print(*{'can', 'difflib', 'serial', 'logging', 'asyncio'} & set(sys.modules))"
+    )
+    command = [sys.executable, "-c", code, str(REPOSITORY / "config" / "can232.yaml")]
+    assert subprocess.run(command, capture_output=True, text=True, check=True, cwd=REPOSITORY).stdout == "\n"
