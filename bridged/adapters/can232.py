@@ -26,9 +26,10 @@ POLL_INTERVAL_S = 0.01
 
 # A command that a crashed program left half typed is in the device's buffer. A CR would finish it: a
 # frame from another time goes out on a live bus. A "C" might even complete it, being a hex digit. "V"
-# is no hex digit, makes every half command invalid, and alone only asks for the version; there are
-# more of them than the longest command has characters, for firmware that cuts lines instead.
-FLUSH = b"V" * (LONGEST_LINE + 3) + b"\r"
+# is no hex digit, makes every half command invalid, and alone only asks for the version. As many of
+# them as a line holds: firmware that looks no further than the data it wants (CANable) counts to 30
+# and begins its line anew.
+FLUSH = b"V" * (LONGEST_LINE - 1) + b"\r"
 
 # F, CAN232 manual: bit -> meaning. Bit 4 is not used.
 STATUS_FLAGS = {

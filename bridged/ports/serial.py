@@ -1,0 +1,245 @@
+"""Serial ports: a tty, a TCP connection to a serial server, or any other pyserial URL."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import grp
+import os
+import pwd
+import socket
+import stat
+import struct
+import termios
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+import serial
+
+from bridged.errors import BridgeError, PortError
+from bridged.pump import POLL_INTERVAL_S, Pump
+
+_DEV: Final = Path("/dev")
+_PROC: Final = Path("/proc")
+
+_BAUDRATE_TOLERANCE: Final = 0.03  # an 8N1 receiver bears about 5 % between both ends
+_TCGETS2: Final = 0x802C542A  # asm-generic/ioctls.h: the speed in bit/s, where termios knows named rates only
+_TERMIOS2: Final = struct.Struct("=IIIIB19sII")  # ..., c_ispeed, c_ospeed (asm-generic/termbits.h)
+
+_CONNECT_LIMIT_S: Final = 5.0
+# A peer that vanishes without a word is noticed after 10 s: silence and 3 probes, or data unacknowledged.
+_TCP_OPTIONS: Final = (
+    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+    (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 4),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3),
+    (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 10_000),  # ms
+)
+_BLOCK: Final = 4096
+
+
+def open_serial(port: str, baudrate: int) -> TtyPort | TcpPort | PumpedPort:
+    """Open a path (`/dev/ttyUSB0`, a pty) or a URL (`socket://host:port`, `rfc2217://host:port`), 8N1.
+
+    `baudrate` in bit/s; socket:// has none. Raises PortError.
+    """
+    if port.startswith("socket://"):
+        return TcpPort(port)
+    if baudrate <= 0:
+        raise PortError(f"{port}: baudrate {baudrate} must be above 0")
+    try:
+        # Any: the stub promises serial.Serial whatever the URL.
+        device: Any = serial.serial_for_url(port, baudrate=baudrate, exclusive=True, timeout=POLL_INTERVAL_S)
+    except (OSError, ValueError, OverflowError, termios.error) as error:
+        raise PortError(_explain(port, baudrate, error)) from error
+    if isinstance(device, serial.Serial):  # a path; hwgrep:// and alt:// end in a tty, too
+        return TtyPort(port, baudrate, device)
+    return PumpedPort(port, device)
+
+
+class TtyPort:
+    """A tty of this machine, locked against other programs that lock."""
+
+    def __init__(self, description: str, baudrate: int, device: serial.Serial) -> None:
+        self.description = description
+        self.failure: BridgeError | None = None  # never set: read() tells
+        self._device = device
+        self.fd = device.fileno()
+        try:
+            _make_raw(self.fd)
+            actual = _actual_baudrate(self.fd)
+        except (OSError, termios.error) as error:
+            self.close()
+            raise PortError(_explain(description, baudrate, error)) from error
+        if abs(actual - baudrate) > baudrate * _BAUDRATE_TOLERANCE:
+            self.close()
+            raise PortError(f"{description}: the driver cannot do {baudrate} Bd, it chose {actual} Bd")
+        with contextlib.suppress(OSError, ValueError):  # most drivers do not know it
+            device.set_low_latency_mode(True)
+
+    def close(self) -> None:
+        self.fd = -1
+        if self._device.is_open:
+            # close() waits 30 s (closing_wait) for a device that takes no more bytes, unless there are none.
+            with contextlib.suppress(termios.error):
+                termios.tcflush(self._device.fileno(), termios.TCIOFLUSH)
+            self._device.close()
+
+
+class TcpPort:
+    """A serial server's raw TCP port, `socket://host:port` as in pyserial.
+
+    Without pyserial's own class: it hides why a connection failed, gives no way to the options of its socket
+    and sleeps in close().
+    """
+
+    def __init__(self, url: str) -> None:
+        self.description = url
+        self.failure: BridgeError | None = None  # never set: read() tells
+        try:
+            parts = urlsplit(url)
+            host, number = parts.hostname, parts.port
+        except ValueError:
+            host = number = None
+        if not host or not number:
+            raise PortError(f"{url}: not of the form socket://HOST:PORT, PORT being 1 to 65535")
+        try:
+            self._socket = socket.create_connection((host, number), _CONNECT_LIMIT_S)
+        except OSError as error:
+            raise PortError(_explain_network(url, error)) from error
+        _notice_dead_peers(self._socket)
+        self._socket.setblocking(False)
+        self.fd = self._socket.fileno()
+
+    def close(self) -> None:
+        self.fd = -1
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+
+class PumpedPort(Pump):
+    """Any other pyserial URL (rfc2217://...): it has no descriptor that carries just the bytes."""
+
+    error = PortError
+
+    def __init__(self, url: str, device: Any) -> None:
+        super().__init__(url, socket.SOCK_STREAM)
+        self._device = device
+        connection = getattr(device, "_socket", None)  # pyserial has no public way to it
+        if isinstance(connection, socket.socket):
+            _notice_dead_peers(connection)
+        self.start()
+
+    def _inward(self) -> None:
+        device = self._device
+        while not self._stopping.is_set():
+            if data := device.read(1):  # returns with the first byte, or after POLL_INTERVAL_S
+                if more := device.in_waiting:
+                    data += device.read(more)
+                self._far.sendall(data)
+
+    def _outward(self) -> None:
+        while data := self._far.recv(_BLOCK):
+            self._device.write(data)
+
+    def _release(self) -> None:
+        self._device.close()
+
+
+def _make_raw(fd: int) -> None:
+    """Every byte as it is. No data is EAGAIN, 0 is a hang-up (with pyserial's VMIN=0 it is both)."""
+    _, _, cflag, _, ispeed, ospeed, cc = termios.tcgetattr(fd)
+    cc[termios.VMIN], cc[termios.VTIME] = 1, 0
+    termios.tcsetattr(fd, termios.TCSANOW, [0, 0, cflag, 0, ispeed, ospeed, cc])
+    os.set_blocking(fd, False)
+
+
+def _actual_baudrate(fd: int) -> int:
+    """What the driver made of the rate it was asked for, in bit/s: it chooses another rather than refuse."""
+    termios2 = fcntl.ioctl(fd, _TCGETS2, bytes(_TERMIOS2.size))
+    return int(_TERMIOS2.unpack(termios2)[-1])
+
+
+def _notice_dead_peers(connection: socket.socket) -> None:
+    for level, option, value in _TCP_OPTIONS:
+        connection.setsockopt(level, option, value)
+
+
+def _explain(port: str, baudrate: int, error: Exception) -> str:
+    """What is wrong and what to do. pyserial raises while it handles the error that tells more."""
+    cause = error.__context__ if isinstance(error.__context__, OSError | termios.error) else error
+    if "://" in port:
+        return _explain_network(port, cause)
+    code = cause.errno if isinstance(cause, OSError) else cause.args[0] if cause.args else None
+    match code:
+        case errno.ENOENT:
+            return f"{port}: {_explain_missing(Path(port))}"
+        case errno.EACCES | errno.EPERM:
+            return f"{port}: {_explain_permission(Path(port))}"
+        case errno.EBUSY | errno.EAGAIN:
+            users = ", ".join(_users(Path(port))) or "another program"
+            return f"{port}: in use by {users}: stop that first"
+        case errno.ENOTTY | errno.EISDIR:
+            return f"{port}: not a serial port"
+        case errno.EIO | errno.ENXIO | errno.ENODEV:
+            return (
+                f"{port}: there is no device behind it, it was perhaps just unplugged ({os.strerror(code)})"
+            )
+        case int():
+            return f"{port}: cannot be set to {baudrate} Bd: {os.strerror(code)}"
+        case _:
+            return f"{port}: cannot be set to {baudrate} Bd: {error}"
+
+
+def _explain_missing(path: Path) -> str:
+    if path.is_symlink():
+        return f"a link to {path.readlink()}, which does not exist: is the adapter unplugged?"
+    patterns = ("serial/by-id/*", "ttyUSB*", "ttyACM*")
+    present = [str(device) for pattern in patterns for device in sorted(_DEV.glob(pattern))]
+    return f"does not exist; serial adapters here: {', '.join(present) or 'none'}"
+
+
+def _explain_permission(path: Path) -> str:
+    try:
+        status = path.stat()
+    except OSError:
+        return "no permission to look into its folder"
+    if not stat.S_ISCHR(status.st_mode):
+        return "not a serial port"
+    uid = os.geteuid()
+    try:
+        user = pwd.getpwuid(uid).pw_name
+        group = grp.getgrgid(status.st_gid).gr_name
+    except KeyError:
+        user, group = str(uid), str(status.st_gid)
+    if status.st_mode & 0o060 == 0o060 and uid != 0 and status.st_gid not in {os.getegid(), *os.getgroups()}:
+        return f"user {user} has no permission: add it to group {group} (`usermod -aG {group} {user}`)"
+    owner = f"{stat.filemode(status.st_mode)}, group {group}"
+    return f"user {user} has no permission ({owner}): check udev rules, and DeviceAllow= of the service"
+
+
+def _users(path: Path) -> list[str]:
+    """Which processes have it open, as far as /proc lets us see: `slcand (process 123)`."""
+    device = str(path.resolve())
+    users = []
+    for process in _PROC.glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # not ours, or just ended
+            if any(str(link.readlink()) == device for link in (process / "fd").iterdir()):
+                users.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
+    return users
+
+
+def _explain_network(url: str, cause: BaseException) -> str:
+    if isinstance(cause, ConnectionRefusedError):
+        return f"{url}: refused, nothing listens there: is the serial server running, and free?"
+    if isinstance(cause, socket.gaierror):
+        return f"{url}: the host name is not known ({cause.strerror})"
+    if isinstance(cause, TimeoutError):
+        return f"{url}: no answer: is the host switched on, is a firewall between?"
+    if "RFC2217" in str(cause):
+        return f"{url}: the server does not speak RFC 2217: use socket://HOST:PORT for a raw TCP port"
+    return f"{url}: {cause}"

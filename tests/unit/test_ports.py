@@ -1,0 +1,439 @@
+"""Ports: real ttys (pty pairs), real TCP, real RFC 2217; closing, hang-ups, and what the errors say."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pty
+import pwd
+import select
+import shutil
+import socket
+import termios
+import threading
+import time
+import tty
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import serial
+from serial import rfc2217
+
+from bridged.errors import PortError
+from bridged.ports import open_port
+from bridged.ports import serial as ports
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+LIMIT_S = 5.0  # for what takes milliseconds
+
+
+def wait_readable(fd: int) -> None:
+    assert select.select([fd], [], [], LIMIT_S)[0], "nothing came"
+
+
+def read_exactly(fd: int, n: int) -> bytes:
+    data = b""
+    while len(data) < n:
+        wait_readable(fd)
+        block = os.read(fd, n - len(data))
+        assert block, f"end of file after {data!r}"
+        data += block
+    return data
+
+
+@pytest.fixture
+def pty_pair() -> Iterator[tuple[int, str]]:
+    """Master, path of the slave. The master is raw from the start, as a real device is."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    path = os.ttyname(slave)
+    os.close(slave)
+    yield master, path
+    with contextlib.suppress(OSError):
+        os.close(master)
+
+
+class TestTty:
+    def test_carries_every_byte_both_ways(self, pty_pair: tuple[int, str]) -> None:
+        master, path = pty_pair
+        everything = bytes(range(256))
+        port = open_port(path, 57600)
+        os.write(master, everything)
+        assert read_exactly(port.fd, 256) == everything
+        assert os.write(port.fd, everything) == 256
+        assert read_exactly(master, 256) == everything
+        port.close()
+
+    def test_undoes_what_a_terminal_does_to_bytes(self, pty_pair: tuple[int, str]) -> None:
+        master, path = pty_pair
+        with open(path, "rb+", buffering=0) as slave:  # noqa: PTH123 - a descriptor of a tty
+            attributes = termios.tcgetattr(slave)
+            attributes[0] |= termios.IXON | termios.ICRNL | termios.BRKINT | termios.ISTRIP
+            attributes[1] |= termios.OPOST | termios.ONLCR
+            attributes[3] |= termios.ICANON | termios.ECHO | termios.ISIG
+            termios.tcsetattr(slave, termios.TCSANOW, attributes)
+            port = open_port(path, 57600)
+        os.write(master, b"\r\x13\x03\xff")
+        assert read_exactly(port.fd, 4) == b"\r\x13\x03\xff"
+        os.write(port.fd, b"\n")
+        assert read_exactly(master, 1) == b"\n"
+        port.close()
+
+    def test_no_data_is_eagain_and_a_hang_up_is_end_of_file(self, pty_pair: tuple[int, str]) -> None:
+        master, path = pty_pair
+        port = open_port(path, 57600)
+        with pytest.raises(BlockingIOError):
+            os.read(port.fd, 1)
+        os.close(master)
+        wait_readable(port.fd)
+        assert os.read(port.fd, 1) == b""
+        port.close()
+
+    def test_drops_what_came_before(self, pty_pair: tuple[int, str]) -> None:
+        master, path = pty_pair
+        keeper = os.open(path, os.O_RDWR | os.O_NOCTTY)
+        os.write(master, b"t1230\r")
+        wait_readable(keeper)
+        port = open_port(path, 57600)
+        with pytest.raises(BlockingIOError):
+            os.read(port.fd, 1)
+        port.close()
+        os.close(keeper)
+
+    def test_close_does_not_wait_for_unsent_output(self, pty_pair: tuple[int, str]) -> None:
+        master, path = pty_pair
+        port = open_port(path, 57600)
+        written = 0
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                written += os.write(port.fd, bytes(1024))
+        start = time.monotonic()
+        port.close()
+        port.close()
+        assert time.monotonic() - start < 2.0
+        assert port.fd == -1
+        # A pty's close() waits for nothing, a UART's until its queue is empty: so see that it was emptied.
+        arrived = 0
+        with contextlib.suppress(OSError):  # EIO: the slave is closed
+            while block := os.read(master, 4096):
+                arrived += len(block)
+        assert arrived <= 4096 < written  # 4096 the master has
+
+    def test_close_after_a_hang_up(self, pty_pair: tuple[int, str]) -> None:
+        master, path = pty_pair
+        port = open_port(path, 57600)
+        os.close(master)
+        port.close()
+
+    def test_opens_a_link_and_opens_it_again(self, pty_pair: tuple[int, str], tmp_path: Path) -> None:
+        link = tmp_path / "can232"
+        link.symlink_to(pty_pair[1])
+        for _ in range(3):
+            port = open_port(str(link), 57600)
+            assert port.description == str(link)
+            assert port.failure is None
+            port.close()
+
+    @pytest.mark.parametrize("baudrate", [2400, 57600, 115200, 230400, 3_000_000, 1_234_567])
+    def test_baudrate_reaches_the_driver(self, pty_pair: tuple[int, str], baudrate: int) -> None:
+        port = open_port(pty_pair[1], baudrate)
+        assert ports._actual_baudrate(port.fd) == baudrate
+        assert (
+            termios.tcgetattr(port.fd)[2] & (termios.CSIZE | termios.PARENB | termios.CSTOPB) == termios.CS8
+        )
+        port.close()
+
+    def test_leaks_no_descriptor(self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:
+        before = os.listdir("/proc/self/fd")  # noqa: PTH208 - names, not paths
+        open_port(pty_pair[1], 57600).close()
+        monkeypatch.setattr(ports, "_actual_baudrate", lambda _: 9600)
+        with pytest.raises(PortError):
+            open_port(pty_pair[1], 57600)
+        assert os.listdir("/proc/self/fd") == before  # noqa: PTH208
+
+
+@contextlib.contextmanager
+def as_nobody() -> Iterator[None]:
+    groups, gid, uid = os.getgroups(), os.getegid(), os.geteuid()
+    nobody = pwd.getpwnam("nobody")
+    os.setgroups([])
+    os.setegid(nobody.pw_gid)
+    os.seteuid(nobody.pw_uid)
+    try:
+        yield
+    finally:
+        os.seteuid(uid)
+        os.setegid(gid)
+        os.setgroups(groups)
+
+
+class TestTtyErrors:
+    def test_missing_names_what_is_there(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(ports, "_DEV", tmp_path)
+        missing = tmp_path / "ttyUSB0"
+        with pytest.raises(
+            PortError, match=r"ttyUSB0: does not exist; serial adapters here: none$"
+        ) as caught:
+            open_port(str(missing), 57600)
+        assert isinstance(caught.value.__cause__, OSError)
+        (tmp_path / "serial/by-id").mkdir(parents=True)
+        for name in ("ttyUSB1", "ttyACM0", "tty1", "serial/by-id/usb-FTDI_A123-if00-port0"):
+            (tmp_path / name).touch()
+        names = f"{tmp_path}/serial/by-id/usb-FTDI_A123-if00-port0, {tmp_path}/ttyUSB1, {tmp_path}/ttyACM0"
+        with pytest.raises(PortError, match=f"here: {names}$"):
+            open_port(str(missing), 57600)
+
+    def test_link_to_nothing(self, tmp_path: Path) -> None:
+        (tmp_path / "link").symlink_to("/dev/pts/nothing")
+        with pytest.raises(PortError, match="a link to /dev/pts/nothing, which does not exist"):
+            open_port(str(tmp_path / "link"), 57600)
+
+    def test_second_open_is_refused_and_names_the_first(self, pty_pair: tuple[int, str]) -> None:
+        port = open_port(pty_pair[1], 57600)
+        name = f"in use by .* .process {os.getpid()}."
+        with pytest.raises(PortError, match=name):
+            open_port(pty_pair[1], 57600)
+        port.close()
+        open_port(pty_pair[1], 57600).close()
+
+    def test_program_that_excludes_others(
+        self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """TIOCEXCL: open() itself gives EBUSY, but not to root, so that the kernel's part is played here."""
+
+        def busy(*_: object, **__: object) -> int:
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+
+        monkeypatch.setattr(os, "open", busy)
+        with pytest.raises(PortError, match="in use by another program"):
+            open_port(pty_pair[1], 57600)
+
+    @pytest.mark.skipif(os.geteuid() != 0, reason="only root can make a device that others may not open")
+    @pytest.mark.parametrize(
+        ("mode", "text"),
+        [
+            (0o620, r"user nobody has no permission \(crw--w----, group tty\): check udev rules"),
+            (0o660, r"user nobody has no permission: add it to group tty \(`usermod -aG tty nobody`\)"),
+        ],
+    )
+    def test_no_permission(self, pty_pair: tuple[int, str], mode: int, text: str) -> None:
+        path = pty_pair[1]
+        shutil.chown(path, "root", "tty")
+        Path(path).chmod(mode)
+        with as_nobody(), pytest.raises(PortError, match=text):
+            open_port(path, 57600)
+
+    def test_not_a_tty(self, tmp_path: Path) -> None:
+        (tmp_path / "file").touch()
+        for path in ("/dev/null", str(tmp_path), str(tmp_path / "file")):
+            with pytest.raises(PortError, match="not a serial port"):
+                open_port(path, 57600)
+
+    def test_unplugged_at_the_wrong_moment(self) -> None:
+        master, slave = pty.openpty()
+        path = os.ttyname(slave)
+        keeper = os.dup(slave)
+        os.close(slave)
+        os.close(master)
+        with pytest.raises(PortError, match=r"no device behind it|does not exist"):
+            open_port(path, 57600)
+        os.close(keeper)
+
+    def test_unplugged_while_it_is_opened(
+        self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def gone(_: int) -> None:
+            raise termios.error(errno.EIO, "Input/output error")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ports, "_make_raw", gone)
+            with pytest.raises(PortError, match="no device behind it") as caught:
+                open_port(pty_pair[1], 57600)
+        open_port(pty_pair[1], 57600).close()  # the lock is not kept, even while the error is looked at
+        assert isinstance(caught.value.__cause__, termios.error)
+
+    def test_driver_that_cannot_do_the_rate(
+        self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A pty does every rate; a 16550 asked for 3 MBd stays silently at 9600."""
+        monkeypatch.setattr(ports, "_actual_baudrate", lambda _: 9600)
+        with pytest.raises(PortError) as caught:
+            open_port(pty_pair[1], 3_000_000)
+        monkeypatch.setattr(ports, "_actual_baudrate", lambda _: 113_636)  # 1.4 % off: bears it
+        open_port(pty_pair[1], 115_200).close()
+        assert str(caught.value).endswith("the driver cannot do 3000000 Bd, it chose 9600 Bd")
+
+    @pytest.mark.parametrize("baudrate", [0, -1, 1 << 40])
+    def test_impossible_baudrate(self, pty_pair: tuple[int, str], baudrate: int) -> None:
+        with pytest.raises(PortError, match=str(baudrate)):
+            open_port(pty_pair[1], baudrate)
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(LIMIT_S)
+        yield server
+
+
+def url(scheme: str, server: socket.socket) -> str:
+    return f"{scheme}://127.0.0.1:{server.getsockname()[1]}"
+
+
+class TestTcp:
+    def test_both_ways_and_hang_up(self, listener: socket.socket) -> None:
+        port = open_port(url("socket", listener), 57600)
+        peer, _ = listener.accept()
+        with pytest.raises(BlockingIOError):
+            os.read(port.fd, 1)
+        peer.sendall(b"V1013\r")
+        assert read_exactly(port.fd, 6) == b"V1013\r"
+        os.write(port.fd, b"V\r")
+        assert peer.recv(16) == b"V\r"
+        peer.close()
+        wait_readable(port.fd)
+        assert os.read(port.fd, 1) == b""
+        port.close()
+        port.close()
+        assert port.fd == -1
+
+    def test_what_was_written_arrives_in_spite_of_close(self, listener: socket.socket) -> None:
+        port = open_port(url("socket", listener), 57600)
+        peer, _ = listener.accept()
+        os.write(port.fd, b"C\r")
+        port.close()
+        assert peer.recv(16) == b"C\r"
+        assert peer.recv(16) == b""
+        peer.close()
+
+    def test_close_does_not_wait_for_a_peer_that_does_not_read(self, listener: socket.socket) -> None:
+        port = open_port(url("socket", listener), 57600)
+        peer, _ = listener.accept()
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(port.fd, bytes(65536))
+        start = time.monotonic()
+        port.close()
+        assert time.monotonic() - start < 2.0
+        peer.close()
+
+    def test_notices_dead_peers_and_sends_at_once(self, listener: socket.socket) -> None:
+        port = open_port(url("socket", listener), 57600)
+        with socket.socket(fileno=os.dup(port.fd)) as twin:
+            for level, option, value in ports._TCP_OPTIONS:
+                assert twin.getsockopt(level, option) == value
+        port.close()
+
+    def test_nothing_listens(self, listener: socket.socket) -> None:
+        addresses = [url(scheme, listener) for scheme in ("socket", "rfc2217")]
+        listener.close()
+        for address in addresses:
+            with pytest.raises(PortError, match=f"{address}: refused, nothing listens there") as caught:
+                open_port(address, 57600)
+            assert isinstance(caught.value.__cause__, OSError)
+
+    @pytest.mark.parametrize(
+        ("error", "text"),
+        [
+            (socket.gaierror(-2, "Name or service not known"), "host name is not known"),
+            (TimeoutError("timed out"), "no answer: is the host switched on"),
+            (OSError(errno.ENETUNREACH, "Network is unreachable"), "Network is unreachable"),
+        ],
+    )
+    def test_not_reachable(self, error: OSError, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(*_: object, **__: object) -> socket.socket:
+            raise error
+
+        monkeypatch.setattr(socket, "create_connection", fail)
+        for scheme in ("socket", "rfc2217"):
+            with pytest.raises(PortError, match=text):
+                open_port(f"{scheme}://gateway:4001", 57600)
+
+    @pytest.mark.parametrize(
+        "bad", ["socket://", "socket://host", "socket://host:0", "socket://h:99999", "socket://h:x"]
+    )
+    def test_malformed(self, bad: str) -> None:
+        with pytest.raises(PortError, match="not of the form socket://HOST:PORT"):
+            open_port(bad, 57600)
+
+    def test_unknown_scheme(self) -> None:
+        with pytest.raises(PortError, match="'telepathy' not known"):
+            open_port("telepathy://device", 57600)
+
+
+class SerialServer:
+    """An RFC 2217 server as in pyserial's examples; its serial port is looped back: it returns every byte."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        self.listener = listener
+        self.device = serial.serial_for_url("loop://", timeout=0.01)
+        self.thread = threading.Thread(target=self.serve, daemon=True)
+        self.thread.start()
+
+    def serve(self) -> None:
+        self.connection, _ = self.listener.accept()
+        self.connection.settimeout(0.01)
+        manager = rfc2217.PortManager(self.device, self)  # type: ignore[arg-type]
+        with self.connection, contextlib.suppress(OSError):
+            while True:
+                with contextlib.suppress(TimeoutError):
+                    data = self.connection.recv(1024)
+                    if not data:
+                        return
+                    self.device.write(b"".join(manager.filter(data)))
+                self.write(b"".join(manager.escape(self.device.read(self.device.in_waiting))))
+
+    def write(self, data: bytes) -> None:
+        self.connection.sendall(data)
+
+    def hang_up(self) -> None:
+        self.connection.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.filterwarnings("ignore:setDaemon:DeprecationWarning", "ignore:setName:DeprecationWarning")
+class TestRfc2217:
+    @pytest.fixture
+    def server(self, listener: socket.socket) -> Iterator[SerialServer]:
+        server = SerialServer(listener)
+        yield server
+        server.thread.join(LIMIT_S)
+        assert not server.thread.is_alive()
+        server.device.close()
+
+    def test_both_ways(self, server: SerialServer) -> None:
+        port = open_port(url("rfc2217", server.listener), 57600)
+        assert server.device.baudrate == 57600
+        with pytest.raises(BlockingIOError):
+            os.read(port.fd, 1)
+        everything = bytes(range(256)) * 8  # with 0xFF, telnet's escape
+        os.write(port.fd, everything)
+        assert read_exactly(port.fd, len(everything)) == everything
+        port.close()
+        port.close()
+        assert port.failure is None
+
+    def test_hang_up_ends_the_descriptor_and_says_why(self, server: SerialServer) -> None:
+        port = open_port(url("rfc2217", server.listener), 57600)
+        server.hang_up()
+        wait_readable(port.fd)
+        assert os.read(port.fd, 1) == b""
+        assert isinstance(port.failure, PortError)
+        assert isinstance(port.failure.__cause__, OSError)
+        assert "connection failed" in str(port.failure)
+        start = time.monotonic()
+        port.close()
+        assert time.monotonic() - start < 2.0  # pyserial itself sleeps 0.3 s
+
+    def test_notices_dead_peers(self, server: SerialServer) -> None:
+        port = open_port(url("rfc2217", server.listener), 57600)
+        connection = port._device._socket  # type: ignore[attr-defined]
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 10_000
+        port.close()
+
+    def test_server_that_speaks_no_rfc2217(self, listener: socket.socket) -> None:
+        with pytest.raises(PortError, match="does not speak RFC 2217: use socket://HOST:PORT"):
+            open_port(url("rfc2217", listener) + "?timeout=0.01", 57600)
