@@ -57,7 +57,7 @@ class SocketcanBus:
         self.fd = sock.fileno()
 
     def dropped(self) -> dict[str, int]:
-        """What SO_RXQ_OVFL counts, but asked for instead of told with a later frame: exact, and free of cost."""
+        """What SO_RXQ_OVFL counts, asked for instead of told with a later frame: exact at any time."""
         if self.fd < 0:
             return {}
         words = struct.unpack("=9I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))

@@ -3,7 +3,8 @@
  *
  * Received      message
  * t10021133\r   CODEC_FRAME: t standard, T extended, r and R the same as remote frames, which carry no data;
- *               4 hex digits of time stamp may follow (8 on some clones): "t100211334D67\r"
+ *               4 hex digits of time stamp may follow (8 on some clones): "t100211334D67\r";
+ *               a remote frame may have them after as much data as its DLC says, of no meaning: slcanpty
  * \r            CODEC_OK, but CODEC_SKIPPED when noise came just before it: it may be that line's end
  * z\r  Z\r      CODEC_SENT
  * \a            CODEC_REFUSED, wherever it comes; it ends a line that it interrupts, which is then skipped
@@ -64,6 +65,14 @@ static size_t report(struct codec_message *msg, enum codec_kind kind, size_t tak
     return taken;
 }
 
+static bool is_hex(const uint8_t *in, size_t n)
+{
+    for (size_t i = 0; i < n; i++)
+        if (!hex_table[in[i]])
+            return false;
+    return true;
+}
+
 /* What follows the data, up to the CR: "" 0, "4D67" 4, "0001E240" 8 digits; -1 when it is anything else. */
 static int stamp_measure(const uint8_t *in, size_t n)
 {
@@ -72,11 +81,8 @@ static int stamp_measure(const uint8_t *in, size_t n)
             return -1;
         if (in[digits] == CR)
             return (int)digits;
-        if (n - digits < STAMP_STEP)
+        if (n - digits < STAMP_STEP || !is_hex(in + digits, STAMP_STEP))
             return -1;
-        for (size_t i = digits; i < digits + STAMP_STEP; i++)
-            if (!hex_table[in[i]])
-                return -1;
     }
     return -1;
 }
@@ -109,6 +115,10 @@ static size_t frame_decode(const uint8_t *in, size_t n, struct can_frame *frame,
     if (n < body)
         return 0;
     int stamp_digits = stamp_measure(in + body, n - body);
+    if (stamp_digits < 0 && remote && n - body > 2 * (size_t)len && is_hex(in + body, 2 * (size_t)len)) {
+        body += 2 * (size_t)len;
+        stamp_digits = stamp_measure(in + body, n - body);
+    }
     if (stamp_digits < 0)
         return 0;
 

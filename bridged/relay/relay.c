@@ -160,10 +160,11 @@ static void rx_flush(struct relay *r, int64_t now)
         r->rx_stalled_ns = r->rx_retry_ns = NEVER;
 }
 
-static void rx_frame(struct relay *r, const struct codec_message *msg)
+static void rx_frame(struct relay *r, const struct can_frame *frame, const struct codec_message *msg)
 {
     r->count.decoded++;
-    if (msg->stamp_digits) {
+    /* Digits after a remote frame may be the data that some firmware gives it. */
+    if (msg->stamp_digits && !(frame->can_id & CAN_RTR_FLAG)) {
         if (!r->stamp_seen)
             relay_emit(r, EVENT_STAMPED, msg->stamp_digits, NULL, 0);
         r->stamp_seen = true;
@@ -193,7 +194,7 @@ static void port_decode(struct relay *r, int64_t now)
             r->count.decoded++;
             r->count.rx_dropped[RX_BUS_FULL]++;
         } else if (msg.kind == CODEC_FRAME) {
-            rx_frame(r, &msg);
+            rx_frame(r, frame, &msg);
         } else if (msg.kind == CODEC_SKIPPED) {
             r->count.skipped_messages++;
             r->count.skipped_bytes += msg.length;

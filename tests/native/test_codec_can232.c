@@ -176,8 +176,15 @@ static const struct decode_case decode_cases[] = {
     CASE("r1232004D6700\r", "123#R2@8"),
     CASE("R0000012320000\r", "00000123#R2@4"),
     CASE("r12321133\r", "123#R2@4"),
-    CASE("r1231AA\r", "skip8"),
-    CASE("r12381122334455667788\r", "skip22"),
+    CASE("r1231AA\r", "123#R1"),
+    CASE("r1231AA4D67\r", "123#R1@4"),
+    CASE("r1231A\r", "skip7"),
+    CASE("r1231AG\r", "skip8"),
+    CASE("r1233AABB\r", "123#R3@4"),
+    CASE("r1233AABBC\r", "skip11"),
+    CASE("r1230AA\r", "skip8"),
+    CASE("r12381122334455667788\r", "123#R8"),
+    CASE("R00000123F1122334455667788EA5F\r", "00000123#R8_F@4"),
 
     /* Time stamps: 0, 4 or 8 hex digits; where the CR is decides. */
     CASE("t1230EA5F\r", "123#@4"),
