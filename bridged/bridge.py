@@ -7,6 +7,7 @@ does the opening of a port, which may take seconds.
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import logging
 import os
@@ -52,6 +53,8 @@ ACCEPT = {Reply.OK: _relay.ACCEPT_OK, Reply.REFUSED: _relay.ACCEPT_REFUSED}
 
 
 def _reason(error: int) -> str:
+    if error == errno.ETIME:
+        return "it took no bytes for too long, and what waited must not be sent late"
     return os.strerror(error) if error else "end of file or hang-up"
 
 
@@ -79,7 +82,7 @@ class Bridge:
         self._tokens = itertools.count(1)
         self._pending: dict[int, Callable[[Answer], None]] = {}
         self._refused_log_at = 0.0
-        self._opened: queue.SimpleQueue[Port | PortError] = queue.SimpleQueue()
+        self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         sync = self.adapter.sync
         self._relay = _relay.Relay(
@@ -234,10 +237,10 @@ class Bridge:
 
     def _open_port(self) -> None:
         adapter = self.config.adapter
-        result: Port | PortError
+        result: Port | Exception
         try:
             result = open_port(adapter.port, adapter.baudrate)
-        except PortError as error:
+        except Exception as error:  # noqa: BLE001 - a bug is raised again in the thread that can end the bridge
             result = error
         self._opened.put(result)
         os.eventfd_write(self._opened_fd, 1)
@@ -247,6 +250,8 @@ class Bridge:
         if isinstance(result, PortError):
             self._dispatch(Event.OPEN_FAILED, str(result))
             return
+        if isinstance(result, Exception):
+            raise result
         self._port = result
         self._relay.attach_port(result.fd)
         self._dispatch(Event.OPENED)
@@ -272,7 +277,9 @@ class Bridge:
         self._steps = None
         self._pending.clear()
         self._relay.detach_port()
-        self._relay.events()  # of the port that is no more
+        for kind, token, text in self._relay.events():  # of the port that is no more, or of the bus
+            if kind in {_relay.EVENT_BUS_LOST, _relay.EVENT_BUS_DOWN}:
+                self._on_event(kind, token, text)
         if self._port is not None:
             self._port.close()
             self._port = None

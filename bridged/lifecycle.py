@@ -77,6 +77,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
 # Late news, without meaning for the state they meet.
 IGNORED: frozenset[tuple[State, Event]] = frozenset(
     [(S.CLOSING, E.SILENT), (S.STOPPING, E.SILENT), (S.STOPPING, E.STOP)]
+    + [(S.BACKOFF, E.PORT_LOST), (S.FAULT, E.PORT_LOST)]  # came with the news that ended it
     + [(S.STOPPED, event) for event in (E.STOP, E.OPEN_FAILED, E.PORT_LOST)]
 )
 

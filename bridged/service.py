@@ -56,8 +56,8 @@ def serve(bridge: Bridge, status: StatusServer | None) -> None:
             selector.register(fd, selectors.EVENT_READ, bridge.on_readable)
         if status is not None:
             selector.register(status, selectors.EVENT_READ, status.on_readable)
-        bridge.start()
         try:
+            bridge.start()
             while not bridge.finished:
                 _turn(bridge, selector)
         except BaseException:

@@ -85,6 +85,12 @@ static int64_t seconds_to_ns(double seconds)
     return (int64_t)(seconds * (double)NS_PER_S);
 }
 
+/* Also false for NaN. */
+static bool seconds_valid(double seconds)
+{
+    return seconds >= 1e-9 && seconds < 1e6;
+}
+
 /* Fills a command; prefix is a text of at most one character. */
 static int command_init(struct command *c, const Py_buffer *data, int accept, const char *prefix)
 {
@@ -103,7 +109,7 @@ static int settings_check(const struct settings *s, double deadline, double answ
         PyErr_Format(PyExc_ValueError, "queue is 1 or more, window 1 to %d", WINDOW_MAX);
         return -1;
     }
-    if (!(deadline > 0 && deadline < 1e6 && answer_timeout > 0 && answer_timeout < 1e6)) {
+    if (!seconds_valid(deadline) || !seconds_valid(answer_timeout)) {
         PyErr_SetString(PyExc_ValueError, "deadline and answer_timeout are seconds, more than 0");
         return -1;
     }
@@ -246,6 +252,10 @@ static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
     if (!PyArg_ParseTuple(args, "y*sd:set_polling", &data, &prefix, &interval))
         return NULL;
     int result = command_init(&c, &data, ACCEPT_REFUSED, prefix);
+    if (!result && !seconds_valid(interval)) {
+        PyErr_SetString(PyExc_ValueError, "interval is seconds, more than 0");
+        result = -1;
+    }
     PyBuffer_Release(&data);
     if (result < 0)
         return NULL;
@@ -268,6 +278,10 @@ static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
     if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*isd:command", names, &token, &data, &accept, &prefix, &timeout))
         return NULL;
     int result = command_init(&c, &data, accept, prefix);
+    if (!result && !seconds_valid(timeout)) {
+        PyErr_SetString(PyExc_ValueError, "timeout is seconds, more than 0");
+        result = -1;
+    }
     PyBuffer_Release(&data);
     if (result < 0)
         return NULL;

@@ -88,7 +88,9 @@ void relay_wake(struct relay *r)
 
 void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length)
 {
-    if (r->event_count == EVENTS_MAX) {
+    bool news = kind == EVENT_UNASKED || kind == EVENT_FRAME_REFUSED || kind == EVENT_UNANSWERED || kind == EVENT_STAMPED
+        || kind == EVENT_BUS_DOWN;
+    if (r->event_count >= (news ? EVENTS_NEWS : EVENTS_MAX)) {
         r->count.events_lost++;
         return;
     }

@@ -27,6 +27,7 @@ enum {
     COMMANDS_MAX = 32,    /* ring: commands from Python that wait for their turn */
     COMMAND_SIZE = 64,    /* bytes of one command */
     EVENTS_MAX = 256,     /* ring: events that Python has not fetched yet */
+    EVENTS_NEWS = 128,    /* of these for what nobody waits for; the rest is for answers and losses */
     EVENT_SIZE = 256,     /* bytes of text in one event */
     PORT_BUFFER = 65536,  /* bytes read from the port and not decoded yet */
     OUT_BUFFER = 4096,    /* bytes encoded and not taken by the port yet */
@@ -164,10 +165,12 @@ struct relay {
     struct command poll; /* length 0: the device speaks by itself */
     int64_t poll_interval_ns, poll_at_ns;
     uint64_t poll_decoded; /* counters.decoded when the last poll was sent */
-    bool polling, resyncing, silent;
+    bool polling, polled, resyncing, silent;
+    bool doubtful; /* an answer may come late: settled before the first frame goes */
     uint32_t sync_tries;
     uint8_t out[OUT_BUFFER];
     size_t out_start, out_end;
+    int64_t out_until_ns; /* what is in `out` is too old then */
 
     /* device -> bus (relay.c) */
     struct codec_state decoder;

@@ -129,7 +129,8 @@ void transmit_reset(struct relay *r)
         r->command_head = (r->command_head + 1) % COMMANDS_MAX;
     }
     r->out_start = r->out_end = 0;
-    r->resyncing = r->silent = r->polling = false;
+    r->resyncing = r->silent = r->polling = r->polled = r->doubtful = false;
+    r->out_until_ns = NEVER;
     r->poll.length = 0;
     r->retry_delay_ns = RETRY_FIRST_NS;
     r->retry_at_ns = 0;
@@ -176,7 +177,7 @@ static void frame_refused(struct relay *r, const struct tx_frame *tx, int64_t no
         transmit_drop(r, r->gate == GATE_STOPPED ? TX_STOPPED : TX_REFUSED);
         return;
     }
-    if (!r->retry_count)
+    if (r->retry_delay_ns == RETRY_FIRST_NS)
         relay_emit(r, EVENT_FRAME_REFUSED, (uint32_t)r->count.retries, NULL, 0);
     uint32_t i = r->retry_count++;
     for (; i && retry_at(r, i - 1)->number > tx->number; i--)
@@ -207,6 +208,7 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
             frame_confirmed(r, done.tx.number);
         break;
     case INFLIGHT_COMMAND:
+        r->doubtful = r->doubtful && how != EVENT_TEXT;
         relay_emit(r, how, done.token, msg->text, msg->length);
         break;
     case INFLIGHT_POLL:
@@ -266,6 +268,8 @@ static void send_command(struct relay *r, const struct command *c, enum inflight
 {
     int64_t timeout = c->timeout_ns ? c->timeout_ns : r->set.answer_timeout_ns;
     struct inflight *in = inflight_push(r, kind, now + timeout);
+    if (now + timeout < r->out_until_ns)
+        r->out_until_ns = now + timeout;
     in->token = c->token;
     in->accept = c->accept;
     in->prefix = c->prefix;
@@ -283,7 +287,18 @@ static void send_frame(struct relay *r, const struct tx_frame *tx, int64_t now)
     struct inflight *in = inflight_push(r, INFLIGHT_FRAME, now + r->set.answer_timeout_ns);
     in->accept = ACCEPT_OK | ACCEPT_REFUSED;
     in->tx = *tx;
+    if (tx->born_ns + r->set.deadline_ns + 1 < r->out_until_ns)
+        r->out_until_ns = tx->born_ns + r->set.deadline_ns + 1;
     r->out_end += n;
+}
+
+/* The only command that does not wait for room in the window, so it looks for room in `out` itself. */
+static void send_sync(struct relay *r, int64_t now)
+{
+    if (r->out_end + COMMAND_SIZE > OUT_BUFFER)
+        relay_port_lost(r, ETIME);
+    else
+        send_command(r, &r->set.sync, INFLIGHT_SYNC, now);
 }
 
 /* An answer is missing. Nothing more is sent until the adapter has answered a command whose answer
@@ -292,17 +307,18 @@ static void resync_start(struct relay *r, int64_t now)
 {
     retry_doubt(r);
     r->resyncing = true;
+    r->doubtful = false;
     r->sync_tries = 1;
     r->count.resyncs++;
     relay_emit(r, EVENT_UNANSWERED, (uint32_t)r->count.resyncs, NULL, 0);
-    send_command(r, &r->set.sync, INFLIGHT_SYNC, now);
+    send_sync(r, now);
 }
 
 static void resync_again(struct relay *r, int64_t now)
 {
     r->inflight_count--; /* the sync command is always the last in flight */
     if (r->sync_tries++ < SYNC_TRIES) {
-        send_command(r, &r->set.sync, INFLIGHT_SYNC, now);
+        send_sync(r, now);
         return;
     }
     while (r->inflight_count)
@@ -321,13 +337,17 @@ static void check_answers(struct relay *r, int64_t now)
     }
     while (r->inflight_count && inflight_at(r, 0)->deadline_ns <= now) {
         bool frame = inflight_at(r, 0)->kind == INFLIGHT_FRAME;
+        bool poll = inflight_at(r, 0)->kind == INFLIGHT_POLL;
         if (!frame) /* a frame keeps its place: its answer may only be late */
             inflight_give_up(r);
-        if (frame || r->gate == GATE_OPEN) {
+        if (frame || r->gate == GATE_OPEN || (poll && r->gate == GATE_LISTEN_ONLY)) {
             resync_start(r, now);
             return;
         }
+        r->doubtful = true;
     }
+    if (r->doubtful && r->gate == GATE_OPEN && !r->inflight_count)
+        resync_start(r, now);
 }
 
 /* Whether a frame may go now. After a refusal one at a time, so that none overtakes another. */
@@ -350,14 +370,16 @@ static bool send_next(struct relay *r, int64_t now)
         r->command_count--;
         return true;
     }
-    if (r->poll.length && r->receiving && !r->polling && !r->silent && now >= r->poll_at_ns) {
-        r->polling = true;
+    bool turn_of_frame = r->polled && frame_ready(r, now); /* a busy bus must not keep frames from going */
+    if (r->poll.length && r->receiving && !r->polling && !r->silent && now >= r->poll_at_ns && !turn_of_frame) {
+        r->polling = r->polled = true;
         r->poll_decoded = r->count.decoded;
         send_command(r, &r->poll, INFLIGHT_POLL, now);
         return true;
     }
     if (!frame_ready(r, now))
         return false;
+    r->polled = false;
     r->count.retries += r->retry_count > 0;
     struct tx_frame tx = r->retry_count ? retry_pop(r) : queue_pop(r);
     send_frame(r, &tx, now);
@@ -380,6 +402,7 @@ static void out_flush(struct relay *r)
         r->out_start += (size_t)n;
     }
     r->out_start = r->out_end = 0;
+    r->out_until_ns = NEVER;
 }
 
 /* Sends what the window allows, in one write. */
@@ -387,7 +410,13 @@ void transmit_pump(struct relay *r, int64_t now)
 {
     if (r->port < 0)
         return;
+    if (now >= r->out_until_ns) { /* the port takes nothing: what waits here must not go out late */
+        relay_port_lost(r, ETIME);
+        return;
+    }
     check_answers(r, now);
+    if (r->port < 0)
+        return;
     if (r->out_start == 0) { /* a message the port took in part is finished first */
         transmit_expire(r, now);
         while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now))
@@ -406,6 +435,8 @@ int64_t transmit_deadline(const struct relay *r)
         uint32_t i = r->resyncing ? r->inflight_count - 1 : 0;
         at = r->inflight[(r->inflight_head + i) % INFLIGHT_MAX].deadline_ns;
     }
+    if (r->out_until_ns < at)
+        at = r->out_until_ns;
     if (r->resyncing || r->silent || r->out_start || r->inflight_count >= r->set.window)
         return at;
     if (r->poll.length && r->receiving && !r->polling && r->poll_at_ns < at)

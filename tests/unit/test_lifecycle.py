@@ -15,8 +15,8 @@ POSSIBLE = {
     State.INITIALISING: {Event.READY, Event.UNANSWERED, Event.REFUSED, Event.PORT_LOST, Event.STOP},
     State.RUNNING: {Event.SILENT, Event.PORT_LOST, Event.STOP},
     State.CLOSING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
-    State.BACKOFF: {Event.TIMER, Event.STOP},
-    State.FAULT: {Event.TIMER, Event.STOP},
+    State.BACKOFF: {Event.TIMER, Event.PORT_LOST, Event.STOP},
+    State.FAULT: {Event.TIMER, Event.PORT_LOST, Event.STOP},
     State.STOPPING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
     State.STOPPED: {Event.OPENED, Event.OPEN_FAILED, Event.PORT_LOST, Event.STOP},
 }
@@ -49,6 +49,7 @@ def test_random_walks_keep_what_must_hold(data: st.DataObject) -> None:
         event = data.draw(st.sampled_from(sorted(possible, key=lambda e: e.name)))
         port_open = port_open or event is Event.OPENED
         state, actions = transition(state, event)
+        waiting = waiting and not actions
         for action in actions:
             if action is Action.RUN:
                 gates_open = True
