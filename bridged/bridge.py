@@ -69,6 +69,7 @@ class Bridge:
         self.config = config
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
+        self._bus_reason = ""  # why the bus is not open
         self.finished = False
         self.adapter = make_adapter(config, memory)
         self._started = time.monotonic()
@@ -146,14 +147,18 @@ class Bridge:
         return {
             "name": self.config.name,
             "state": self.state.value,
-            "reason": self.reason,
+            "reason": "; ".join(filter(None, (self.reason, self._bus_reason))),
             "adapter": {
                 "type": self.config.adapter.type,
                 "port": self.config.adapter.port,
                 "version": identity.version,
                 "serial_number": identity.serial_number,
             },
-            "bus": {"interface": self.config.bus.interface, "channel": self.config.bus.channel},
+            "bus": {
+                "interface": self.config.bus.interface,
+                "channel": self.config.bus.channel,
+                "open": self._bus is not None,
+            },
             "counters": {
                 "rx_frames": counters.pop("rx_frames"),
                 "tx_frames": counters.pop("tx_frames"),
@@ -172,11 +177,12 @@ class Bridge:
         try:
             self._bus = open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options)
         except BusError as error:
-            if self.reason != str(error):
+            if self._bus_reason != str(error):
                 log.error("bus not open: %s; trying again every %g s", error, BUS_RETRY_S)
-            self.reason = str(error)
+            self._bus_reason = str(error)
             self._bus_timer = time.monotonic() + BUS_RETRY_S
             return
+        self._bus_reason = ""
         if self._bus.warning:
             log.warning("%s", self._bus.warning)
         log.info("bus open: %s", self._bus.description)
@@ -380,12 +386,15 @@ class Bridge:
             log.debug("adapter said %r unasked", text)
 
     def _on_frame_refused(self) -> None:
-        """Asks why (manual 1.4: F after an error answer), at most once in a while."""
-        now = time.monotonic()
-        if now < self._refused_log_at or self.state is not State.RUNNING:
-            return
-        self._refused_log_at = now + REFUSED_LOG_INTERVAL_S
-        self._ask(self.adapter.status_request(), self._log_status)
+        """Asks why (manual 1.4: F after an error answer)."""
+        if self.state is State.RUNNING:
+            self._ask(self.adapter.status_request(), self._on_status)
 
-    def _log_status(self, answer: Answer) -> None:
-        log.warning("adapter refuses frames; its status: %s", self.adapter.describe_status(answer))
+    def _on_status(self, answer: Answer) -> None:
+        if answer.reply is Reply.REFUSED:
+            self._dispatch(Event.SILENT, "the adapter's channel is closed: it was reset, or lost its power")
+            return
+        now = time.monotonic()
+        if now >= self._refused_log_at:
+            self._refused_log_at = now + REFUSED_LOG_INTERVAL_S
+            log.warning("adapter refuses frames; its status: %s", self.adapter.describe_status(answer))

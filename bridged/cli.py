@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
+import select
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bridged.errors import BridgeError, ConfigError
 
@@ -24,7 +26,7 @@ CONFIG_DIRECTORY = Path("/etc/can-bridge")
 def config_path(name: str) -> Path:
     """A file, or the NAME of one in /etc/can-bridge."""
     path = Path(name)
-    if "/" in name or path.suffix in {".yaml", ".yml"} or path.is_file():
+    if "/" in name or path.suffix in {".yaml", ".yml"} or os.path.isfile(name):  # noqa: PTH113 - False, whatever the name
         return path
     return CONFIG_DIRECTORY / f"{name}.yaml"
 
@@ -53,10 +55,35 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
+class _StderrHandler(logging.StreamHandler[Any]):
+    """Never waits for a reader: a full pipe must not stop the bridge. What it could not say it counts."""
+
+    lost = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        poll = select.poll()
+        try:
+            poll.register(self.stream, select.POLLOUT)
+            writable = poll.poll(0)
+        except (OSError, ValueError):  # closed
+            return
+        if not writable:
+            self.lost += 1
+            return
+        if self.lost:
+            record.msg, record.args = f"{record.getMessage()} ({self.lost} lines before this are lost)", ()
+            self.lost = 0
+        super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Nobody is left to be told."""
+
+
 def _log_to_stderr(name: str, *, verbose: bool) -> None:
     logging.basicConfig(
         format=f"%(asctime)s %(levelname)-7s {name}: %(message)s",
         level=logging.DEBUG if verbose else logging.INFO,
+        handlers=[_StderrHandler()],
     )
 
 
@@ -72,13 +99,14 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _status_path(args: argparse.Namespace) -> Path:
-    from bridged.status import StatusError, runtime_directory, socket_path  # noqa: PLC0415
+    from bridged.status import StatusError, running_sockets, socket_path  # noqa: PLC0415
 
     if args.socket:
         return Path(args.socket)
+    running = running_sockets()
     if args.name:
-        return socket_path(Path(args.name).stem)
-    running = sorted(runtime_directory().glob("*.sock"))
+        name = config_path(args.name).stem
+        return next((path for path in running if path.stem == name), socket_path(name))
     if len(running) == 1:
         return running[0]
     names = ", ".join(path.stem for path in running)
@@ -92,7 +120,7 @@ def _status(args: argparse.Namespace) -> int:
 
     status = query(_status_path(args))
     print(json.dumps(status, indent=2) if args.json else render(status))
-    return 0 if status["state"] == "running" else EXIT_NOT_RUNNING
+    return 0 if status["state"] == "running" and status["bus"]["open"] else EXIT_NOT_RUNNING
 
 
 def _parser(command: str | None) -> argparse.ArgumentParser:
@@ -165,3 +193,5 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_NOT_RUNNING if args.command == "status" else 1
     except BrokenPipeError:
         return 1
+    except KeyboardInterrupt:  # before the handlers were there
+        return 130

@@ -6,9 +6,11 @@ device. Where the kernel has CAN the interface is vcan0, else python-can's `virt
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -24,11 +26,12 @@ from bridged.errors import BusError
 from bridged.memory import FileMemory
 from bridged.service import serve
 from bridged.simulators.can232 import Can232
-from bridged.simulators.serve import Simulator
+from bridged.simulators.serve import Simulator, positive
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Callable
 
 CHANNEL = "vcan0"
 UART_RATE = 115_200
@@ -48,9 +51,9 @@ bus:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `can-bridge demo`."""
-    parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="default: 10")
+    parser.add_argument("--duration", type=positive, default=10.0, metavar="SECONDS", help="default: 10")
     parser.add_argument(
-        "--rate", type=float, default=5.0, metavar="FPS", help="frames a second each way; default: 5"
+        "--rate", type=positive, default=5.0, metavar="FPS", help="frames a second each way; default: 5"
     )
 
 
@@ -59,6 +62,12 @@ def candump_line(channel: str, message: can.Message) -> str:
     can_id = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
     data = "remote request" if message.is_remote_frame else " ".join(f"{byte:02X}" for byte in message.data)
     return f"  {channel}  {can_id:>8}   [{message.dlc}]  {data}"
+
+
+def _say(line: str) -> None:
+    """In one write, so that two threads do not share a line."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 class Program:
@@ -71,17 +80,23 @@ class Program:
         self._interval_s = 1 / rate_fps
         self._stop = threading.Event()
         self._bus = can.Bus(interface=interface, channel=channel)
-        self._threads = [threading.Thread(target=loop) for loop in (self._receive, self._send)]
+        self._threads = [
+            threading.Thread(target=self._quietly, args=(loop,)) for loop in (self._receive, self._send)
+        ]
 
     def start(self) -> None:
         for thread in self._threads:
             thread.start()
 
+    def _quietly(self, loop: Callable[[], None]) -> None:
+        with contextlib.suppress(OSError):  # nobody reads what we print; _Watch ends it all
+            loop()
+
     def _receive(self) -> None:
         while not self._stop.is_set():
             if message := self._bus.recv(0.1):
                 self.received += 1
-                print(f"{candump_line(self._channel, message)}   from the adapter", flush=True)
+                _say(f"{candump_line(self._channel, message)}   from the adapter")
 
     def _send(self) -> None:
         rng = random.Random(1)
@@ -90,12 +105,13 @@ class Program:
             message = can.Message(arbitration_id=rng.randrange(0x800), is_extended_id=False, data=data)
             self._bus.send(message)
             self.sent += 1
-            print(f"{candump_line(self._channel, message)}   to the adapter", flush=True)
+            _say(f"{candump_line(self._channel, message)}   to the adapter")
 
     def stop(self) -> None:
         self._stop.set()
         for thread in self._threads:
-            thread.join()
+            if thread.ident is not None:
+                thread.join()
         self._bus.shutdown()
 
 
@@ -133,20 +149,25 @@ class _Watch(threading.Thread):
         self.done = threading.Event()
 
     def run(self) -> None:
-        started = time.monotonic()
+        try:
+            self._watch()
+        except OSError:  # nobody reads what we print
+            pass
+        finally:
+            self._program.stop()
+            if not self.done.is_set():
+                _end_serving()
+
+    def _watch(self) -> None:
+        end = time.monotonic() + self._duration_s
         running = False
-        while not self.done.wait(0.02 if not running else STATUS_INTERVAL_S):
+        while time.monotonic() < end and not self.done.wait(STATUS_INTERVAL_S if running else 0.02):
             status = self._bridge.snapshot()
             if not running and status["state"] == "running":
                 running = True
                 self._program.start()
             if running:
-                print(_status_line(status), flush=True)
-            if time.monotonic() - started >= self._duration_s:
-                break
-        if running:
-            self._program.stop()
-        _end_serving()
+                _say(_status_line(status))
 
 
 def _status_line(status: dict[str, Any]) -> str:

@@ -10,6 +10,8 @@ import logging
 import os
 from pathlib import Path
 
+from bridged.status import runtime_directory
+
 log = logging.getLogger(__name__)
 
 
@@ -19,8 +21,12 @@ def state_directory() -> Path:
         return Path(given.split(":", maxsplit=1)[0])
     if os.geteuid() == 0:
         return Path("/var/lib/can-bridge")
-    home = os.environ.get("XDG_STATE_HOME") or str(Path("~/.local/state").expanduser())
-    return Path(home) / "can-bridge"
+    if home := os.environ.get("XDG_STATE_HOME"):
+        return Path(home) / "can-bridge"
+    try:
+        return Path("~/.local/state/can-bridge").expanduser()
+    except RuntimeError:  # a user without a home
+        return runtime_directory()
 
 
 class FileMemory:

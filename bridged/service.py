@@ -20,17 +20,19 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Handler = Callable[[], None]
+# SIGHUP comes when the terminal of a bridge in the foreground goes.
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
 def _stop_signals() -> Iterator[int]:
-    """A descriptor that becomes readable on SIGTERM and SIGINT; ends a select() at once."""
+    """A descriptor that becomes readable when one of STOP_SIGNALS comes; ends a select() at once."""
     reader, writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def nothing(_number: int, _frame: FrameType | None) -> None:
         """The number comes through the pipe."""
 
-    before = {number: signal.signal(number, nothing) for number in (signal.SIGTERM, signal.SIGINT)}
+    before = {number: signal.signal(number, nothing) for number in STOP_SIGNALS}
     descriptor = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     try:
         yield reader

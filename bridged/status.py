@@ -1,6 +1,6 @@
 """The status of a running bridge over a local socket: one JSON object for each connection.
 
-name, state, reason, adapter {type, port, version, serial_number}, bus {interface, channel},
+name, state, reason, adapter {type, port, version, serial_number}, bus {interface, channel, open},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
 from the adapter; tx_retries; tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
 At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_READ).
@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import socket
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ANSWER_TIMEOUT_S = 5.0
+SYSTEM_DIRECTORY = Path("/run/can-bridge")
 # Reasons in tx_dropped for frames that were lost before the relay could read them.
 LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow", "bus-recv-failed")
 
@@ -32,13 +34,19 @@ class StatusError(BridgeError):
 def runtime_directory() -> Path:
     """/run/can-bridge for root, below XDG_RUNTIME_DIR for anybody else."""
     if os.geteuid() == 0:
-        return Path("/run/can-bridge")
+        return SYSTEM_DIRECTORY
     base = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/can-bridge-{os.geteuid()}"
     return Path(base) / "can-bridge"
 
 
 def socket_path(name: str) -> Path:
     return runtime_directory() / f"{name}.sock"
+
+
+def running_sockets() -> list[Path]:
+    """The status sockets there are, of this user's bridges and of root's."""
+    folders = {runtime_directory(), SYSTEM_DIRECTORY}
+    return sorted(path for folder in folders for path in folder.glob("*.sock"))
 
 
 class StatusServer:
@@ -51,9 +59,10 @@ class StatusServer:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-            _refuse_second(path)
-            path.unlink(missing_ok=True)
+            _clear_away(path)
             self._socket.bind(str(path))
+            path.chmod(0o666)  # who may look, may read: it takes no commands
+            self._inode = path.stat().st_ino
             self._socket.listen(16)
         except OSError as error:
             self._socket.close()
@@ -83,18 +92,28 @@ class StatusServer:
 
     def close(self) -> None:
         self._socket.close()
-        self.path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            if self.path.lstat().st_ino == self._inode:
+                self.path.unlink()
 
 
-def _refuse_second(path: Path) -> None:
-    """StatusError if a bridge answers there; a socket that a dead one left is no obstacle."""
+def _clear_away(path: Path) -> None:
+    """Removes the socket that a dead bridge left; StatusError for anything else that is there."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            msg = f"{path} exists and is no socket: --socket PATH wants a place of its own"
+            raise StatusError(msg)
+    except FileNotFoundError:
+        return
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:
             probe.connect(str(path))
-        except OSError as error:
-            if not isinstance(error, TimeoutError):
-                return
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+        except TimeoutError:
+            pass
     msg = f"a bridge named {path.stem!r} is running already (it answers on {path})"
     raise StatusError(msg)
 
@@ -112,7 +131,9 @@ def query(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         msg = f"no bridge answers on {path}: {error}"
         raise StatusError(msg) from error
-    assert isinstance(status, dict)
+    if not isinstance(status, dict) or "counters" not in status:
+        msg = f"what answers on {path} is no bridge"
+        raise StatusError(msg)
     return status
 
 
@@ -129,7 +150,7 @@ def render(status: dict[str, Any]) -> str:
         [
             f"{status['name']}: {status['state']}{reason}, up {status['uptime_s']:.0f} s",
             f"  adapter     {adapter['type']} on {adapter['port']}, {identity}",
-            f"  bus         {bus['interface']} {bus['channel']}",
+            f"  bus         {bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
             f"  to bus      {counters['rx_frames']} frames, {counters['rx_errors']} errors on the line",
             f"  dropped     {_reasons(counters['rx_dropped'])}",
             f"  to adapter  {counters['tx_frames']} frames, {counters['tx_retries']} retries, "

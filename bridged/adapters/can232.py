@@ -214,8 +214,6 @@ class Can232:
         return self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), text="F")
 
     def describe_status(self, answer: Answer) -> str:
-        if answer.reply is REFUSED:
-            return "channel closed"
         if not re.fullmatch("F[0-9A-Fa-f]{2}", answer.text):
             return "unknown"
         flags = int(answer.text[1:], 16)

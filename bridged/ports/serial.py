@@ -183,6 +183,9 @@ def _explain(port: str, baudrate: int, error: Exception) -> str:
         case errno.EBUSY | errno.EAGAIN:
             users = ", ".join(_users(Path(port))) or "another program"
             return f"{port}: in use by {users}: stop that first"
+        case errno.ENOTTY if _is_tty_name(port):  # another line discipline has it, as of slcand
+            holders = ", ".join(_users(Path(port))) or "another program"
+            return f"{port}: in use by {holders}: stop that first"
         case errno.ENOTTY | errno.EISDIR:
             return f"{port}: not a serial port"
         case errno.EIO | errno.ENXIO | errno.ENODEV:
@@ -193,6 +196,11 @@ def _explain(port: str, baudrate: int, error: Exception) -> str:
             return f"{port}: cannot be set to {baudrate} Bd: {os.strerror(code)}"
         case _:
             return f"{port}: cannot be set to {baudrate} Bd: {error}"
+
+
+def _is_tty_name(port: str) -> bool:
+    path = Path(port).resolve()
+    return path.name.startswith("tty") or path.parent.name == "pts"
 
 
 def _explain_missing(path: Path) -> str:

@@ -68,7 +68,7 @@ enum event_kind {
     EVENT_TEXT,      /* a command was answered with a text */
     EVENT_TIMEOUT,   /* a command was not answered in time, or the port went away before */
     EVENT_UNASKED,   /* a text that no command asked for */
-    EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many so far. Said once per series */
+    EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many retries so far. Not at each */
     EVENT_UNANSWERED,    /* an answer is missing: the line is being resynchronised */
     EVENT_SILENT,    /* not even the sync command is answered; nothing is sent until a new attach */
     EVENT_STAMPED,   /* a frame had a time stamp; said once per attach */
@@ -96,7 +96,13 @@ struct command {
     uint8_t data[COMMAND_SIZE];
 };
 
-enum inflight_kind { INFLIGHT_FRAME, INFLIGHT_COMMAND, INFLIGHT_POLL, INFLIGHT_SYNC };
+enum inflight_kind {
+    INFLIGHT_FRAME,
+    INFLIGHT_COMMAND,
+    INFLIGHT_POLL,
+    INFLIGHT_CHECK, /* the sync command after a refusal: was it one? */
+    INFLIGHT_SYNC,  /* the same after a missing answer */
+};
 
 struct inflight {
     enum inflight_kind kind;
@@ -166,6 +172,7 @@ struct relay {
     int64_t poll_interval_ns, poll_at_ns;
     uint64_t poll_decoded; /* counters.decoded when the last poll was sent */
     bool polling, polled, resyncing, silent;
+    bool checking; /* a refusal is not believed yet: INFLIGHT_CHECK is to be sent, or its answer to come */
     bool doubtful; /* an answer may come late: settled before the first frame goes */
     uint32_t sync_tries;
     uint8_t out[OUT_BUFFER];

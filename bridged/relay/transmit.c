@@ -10,6 +10,7 @@
 
 #define RETRY_FIRST_NS INT64_C(1000000)
 #define RETRY_LAST_NS INT64_C(16000000)
+#define RETRIES_TOLD 16 /* about four times a second */
 
 static struct tx_frame *queue_at(struct relay *r, uint32_t i)
 {
@@ -106,6 +107,8 @@ static void inflight_give_up(struct relay *r)
         relay_emit(r, EVENT_TIMEOUT, head->token, NULL, 0);
     else if (head->kind == INFLIGHT_POLL)
         r->polling = false;
+    else
+        r->checking = false;
     r->inflight_head = (r->inflight_head + 1) % INFLIGHT_MAX;
     r->inflight_count--;
 }
@@ -129,7 +132,7 @@ void transmit_reset(struct relay *r)
         r->command_head = (r->command_head + 1) % COMMANDS_MAX;
     }
     r->out_start = r->out_end = 0;
-    r->resyncing = r->silent = r->polling = r->polled = r->doubtful = false;
+    r->resyncing = r->silent = r->polling = r->polled = r->checking = r->doubtful = false;
     r->out_until_ns = NEVER;
     r->poll.length = 0;
     r->retry_delay_ns = RETRY_FIRST_NS;
@@ -164,8 +167,10 @@ static void frame_confirmed(struct relay *r, uint64_t number)
     }
 }
 
-/* BELL says that the adapter did not take the frame: sending it again cannot double it. While the
- * line is being resynchronised BELL may mean something else (the sync command spliced to a broken
+/* BELL says that the adapter did not take the frame: sending it again cannot double it. But a BELL may
+ * be noise, or a second answer to the frame before (slcanpty); so first the sync command goes, and if the
+ * frame's own answer comes before that command's, the frame was taken after all. While the line is being
+ * resynchronised BELL may mean something else (the sync command spliced to a broken
  * one), and a frame sent twice is worse than one dropped and counted. */
 static void frame_refused(struct relay *r, const struct tx_frame *tx, int64_t now)
 {
@@ -177,12 +182,13 @@ static void frame_refused(struct relay *r, const struct tx_frame *tx, int64_t no
         transmit_drop(r, r->gate == GATE_STOPPED ? TX_STOPPED : TX_REFUSED);
         return;
     }
-    if (r->retry_delay_ns == RETRY_FIRST_NS)
+    if (r->retry_delay_ns == RETRY_FIRST_NS || r->count.retries % RETRIES_TOLD == 0)
         relay_emit(r, EVENT_FRAME_REFUSED, (uint32_t)r->count.retries, NULL, 0);
     uint32_t i = r->retry_count++;
     for (; i && retry_at(r, i - 1)->number > tx->number; i--)
         *retry_at(r, i) = *retry_at(r, i - 1);
     *retry_at(r, i) = *tx;
+    r->checking = true;
     r->retry_at_ns = now + r->retry_delay_ns;
     r->retry_delay_ns *= r->retry_delay_ns < RETRY_LAST_NS ? 2 : 1;
 }
@@ -214,8 +220,11 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
     case INFLIGHT_POLL:
         poll_done(r, now);
         break;
+    case INFLIGHT_CHECK:
+        r->checking = false;
+        break;
     case INFLIGHT_SYNC:
-        r->resyncing = false;
+        r->resyncing = r->checking = false;
         break;
     }
 }
@@ -235,6 +244,14 @@ static void answer_text(struct relay *r, const struct codec_message *msg, int64_
     relay_emit(r, EVENT_UNASKED, 0, msg->text, msg->length);
 }
 
+/* Whether "done" can only be the answer to a frame that a BELL seemed to refuse. */
+static bool answers_refused(struct relay *r)
+{
+    const struct inflight *head = inflight_at(r, 0);
+    bool expected = r->inflight_count && (head->kind == INFLIGHT_FRAME || head->accept & ACCEPT_OK);
+    return r->retry_count && (r->checking || r->resyncing) && !expected;
+}
+
 /* CODEC_OK, CODEC_SENT, CODEC_REFUSED or CODEC_TEXT came from the device. */
 void transmit_answer(struct relay *r, const struct codec_message *msg, int64_t now)
 {
@@ -247,6 +264,10 @@ void transmit_answer(struct relay *r, const struct codec_message *msg, int64_t n
     bool refused = msg->kind == CODEC_REFUSED;
     uint8_t needed = refused ? ACCEPT_REFUSED : ACCEPT_OK;
 
+    if (!refused && answers_refused(r)) {
+        frame_confirmed(r, retry_pop(r).number);
+        return;
+    }
     if (!r->inflight_count || !(head->accept & needed)
         || (msg->kind == CODEC_SENT && head->kind != INFLIGHT_FRAME)) {
         r->count.stray_answers++;
@@ -364,6 +385,11 @@ static bool send_next(struct relay *r, int64_t now)
 {
     if (r->resyncing || r->inflight_count >= r->set.window)
         return false;
+    if (r->checking) {
+        if (!r->inflight_count)
+            send_command(r, &r->set.sync, INFLIGHT_CHECK, now);
+        return false;
+    }
     if (r->command_count) {
         send_command(r, &r->commands[r->command_head], INFLIGHT_COMMAND, now);
         r->command_head = (r->command_head + 1) % COMMANDS_MAX;
@@ -437,7 +463,7 @@ int64_t transmit_deadline(const struct relay *r)
     }
     if (r->out_until_ns < at)
         at = r->out_until_ns;
-    if (r->resyncing || r->silent || r->out_start || r->inflight_count >= r->set.window)
+    if (r->resyncing || r->silent || r->checking || r->out_start || r->inflight_count >= r->set.window)
         return at;
     if (r->poll.length && r->receiving && !r->polling && r->poll_at_ns < at)
         at = r->poll_at_ns;

@@ -347,6 +347,18 @@ def load_eeprom(path: Path | None) -> Eeprom:
         raise PortError(f"{path}: not an EEPROM file of this simulator: {error}") from error
 
 
+def positive(text: str) -> float:
+    """A finite number above 0, for argparse."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return value
+
+
+def _whole(text: str) -> int:
+    return int(positive(str(int(text))))
+
+
 def _matching(pattern: str, meaning: str) -> Callable[[str], str]:
     def check(text: str) -> str:
         if not re.fullmatch(pattern, text):
@@ -366,15 +378,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="symbolic link to the terminal, made now, removed at the end",
     )
     add("--bus", metavar="IFACE", help="SocketCAN interface on its CAN side, as vcan1")
-    add("--traffic", type=float, default=0.0, metavar="FPS", help="mixed frames a second from a made-up bus")
+    add(
+        "--traffic",
+        type=positive,
+        default=0.0,
+        metavar="FPS",
+        help="mixed frames a second from a made-up bus",
+    )
     add(
         "--uart-rate",
-        type=int,
+        type=_whole,
         metavar="BAUD",
         help="pace the line at this rate; default: as fast as it goes",
     )
     add(
-        "--processing", type=float, default=0.0, metavar="SECONDS", help="time the device takes for a command"
+        "--processing",
+        type=positive,
+        default=0.0,
+        metavar="SECONDS",
+        help="time the device takes for a command",
     )
     version = _matching(r"V\d{4}", "a version like V1324")
     add("--version", type=version, default="V1324", dest="device_version", metavar="V", help="answer to V")
@@ -398,6 +420,9 @@ def run(args: argparse.Namespace) -> int:
         serial_number=args.serial_number,
         processing_s=args.processing,
     )
+    for path in (args.link, args.state, args.eeprom):
+        if path and not path.parent.is_dir():
+            raise PortError(f"{path}: there is no directory {path.parent}")
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_can(args.bus)) if args.bus else None
         simulator = Simulator(

@@ -2,6 +2,7 @@
 
 import contextlib
 import random
+import select
 import socket
 import struct
 from collections.abc import Iterator
@@ -147,13 +148,19 @@ def test_refused_frame_is_sent_again_until_its_deadline(rig: Rig) -> None:
     rig.bus.send(can_frame(1))
     rig.turn()
     tries = 0
-    while said := rig.said():
-        tries += 1
-        assert number_of(said[0]) == 1
-        rig.port.send(b"\a")
+    while True:
+        for line in rig.said():
+            if line == b"V":  # is the refusal one?
+                rig.port.send(b"V1324\r")
+            else:
+                tries += 1
+                assert number_of(line) == 1
+                rig.port.send(b"\a")
+            rig.turn()
         due = rig.turn()
-        if due is not None:
-            assert due > rig.now
+        if due is None:
+            break
+        if not select.select([rig.port], (), (), 0)[0]:  # nothing said: time goes on
             rig.now = due
             rig.turn()
     c = rig.counters()
@@ -170,10 +177,15 @@ def test_refused_frame_is_not_sent_after_a_later_one_was_taken() -> None:
         rig.turn()
         assert [number_of(x) for x in rig.said()] == [0, 1]
         rig.port.send(b"\az\r")  # 0 refused, 1 taken
+        rig.turn()
+        assert rig.said() == [b"V"]
+        rig.port.send(b"V1324\r")
         rig.turn(20)
         assert [number_of(x) for x in rig.said()] == [2, 3]
         rig.port.send(b"\a\a")
         rig.turn()
+        assert rig.said() == [b"V"]
+        rig.port.send(b"V1324\r")
         for n in (2, 3):  # one at a time now, in order
             rig.turn(20)
             assert [number_of(x) for x in rig.said()] == [n]
@@ -181,6 +193,30 @@ def test_refused_frame_is_not_sent_after_a_later_one_was_taken() -> None:
         rig.turn()
         c = rig.counters()
         assert (c["tx_frames"], c["overtaken"], c["tx_retries"]) == (3, 1, 2)
+
+
+@pytest.mark.parametrize("first", [b"\a", b"\r\a"])
+def test_a_bell_that_is_no_answer_does_not_send_a_frame_twice(rig: Rig, first: bytes) -> None:
+    """Noise, or slcanpty's second answer to a remote frame: the frame's own answer comes after it."""
+    for n in range(2):
+        rig.bus.send(can_frame(n))
+    rig.turn()
+    rig.port.send(first)
+    rig.turn()
+    lines = rig.said()
+    assert [number_of(x) for x in lines if x != b"V"] == ([0] if first == b"\a" else [0, 1])
+    if lines[-1] != b"V":
+        rig.turn()
+        lines += rig.said()
+    rig.port.send(b"z\rV1324\r")
+    rig.turn(50)
+    if first == b"\a":
+        assert [number_of(x) for x in rig.said()] == [1]
+        rig.port.send(b"z\r")
+        rig.turn(50)
+    assert rig.said() == []
+    c = rig.counters()
+    assert (c["tx_frames"], c["tx_retries"], c["queued"]) == (2, 0, 0)
 
 
 def test_stale_frames_are_dropped_not_sent(rig: Rig) -> None:
