@@ -166,7 +166,10 @@ def _read_file(path: Path, top: Section) -> Config | None:
     bus = _read_bus(top.section("bus"))
     transmit: TransmitConfig | None = TransmitConfig()
     if "transmit" in top.nodes:
-        transmit = _read_plain(top.section("transmit", required=False), TransmitConfig)
+        transmit_section = top.section("transmit", required=False)
+        transmit = _read_plain(transmit_section, TransmitConfig)
+        if adapter and transmit and transmit_section and (text := _window_problem(adapter, transmit)):
+            transmit_section.refuse_value("window", text)
         if channel_section and channel_section.values.get("listen_only"):
             top.refuse_key(
                 "transmit",
@@ -194,6 +197,20 @@ def _read_adapter(section: Section | None) -> AdapterConfig | None:
     if section and (text := _port_problem(section.values.get("port", "/"))):
         section.refuse_value("port", text)
     return adapter
+
+
+def _window_problem(adapter: AdapterConfig, transmit: TransmitConfig) -> str | None:
+    """A window's frames lie in the line, where they grow old uncounted: 27 characters each at the most."""
+    if transmit.window == 1 or "://" in adapter.port:
+        return None
+    frame_s = 27 * 10 / adapter.baudrate
+    room = max(1, int(transmit.deadline_s / 2 / frame_s))
+    if transmit.window <= room:
+        return None
+    return (
+        f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {adapter.baudrate} Bd, more than "
+        f"half of the deadline of {transmit.deadline_s:g} s, so they could be sent late; at most {room}"
+    )
 
 
 def _port_problem(port: str) -> str | None:

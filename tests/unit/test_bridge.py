@@ -90,6 +90,7 @@ class Bench:
 
     def close(self) -> None:
         self.pull_out()
+        self.bus.close()
         self.bus.far.close()
 
 
@@ -349,3 +350,77 @@ def test_an_adapter_that_was_reset_is_initialised_again(bench: Bench) -> None:
     assert "channel is closed" in bridge.reason
     run_until(bridge, lambda: bridge.state is State.RUNNING)
     stopped(bridge)
+
+
+class PairPort:
+    """A port whose device is a thread of the test."""
+
+    description = "pair"
+    failure = None
+
+    def __init__(self) -> None:
+        self._near, self.far = socket.socketpair()
+        self._near.setblocking(False)
+        self.far.settimeout(LIMIT_S)
+        self.fd = self._near.fileno()
+
+    def close(self) -> None:
+        self._near.close()
+
+
+def lines(port: PairPort) -> Iterator[bytes]:
+    while True:
+        for line in port.far.recv(4096).replace(b"\r", b"\r\n").split(b"\n"):
+            if line.strip():
+                yield line
+
+
+@pytest.mark.parametrize(("last", "state"), [(b"S4\r", State.FAULT), (b"O\r", State.BACKOFF)])
+def test_the_plug_is_pulled_in_the_moment_that_ends_a_state(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, last: bytes, state: State
+) -> None:
+    port = PairPort()
+    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+
+    def device() -> None:
+        closing = 0
+        for line in lines(port):
+            closing += closing > 0
+            if line == last and state is State.FAULT:
+                port.far.send(b"\a")
+                break
+            if line == last:
+                closing = 1  # no answer: it gives up, and closes
+            elif closing < 3:
+                port.far.send(b"V1324\r" if b"V" in line else b"NA123\r" if b"N" in line else b"\r")
+            else:
+                port.far.send(b"\r")
+                break
+        port.far.close()
+
+    thread = threading.Thread(target=device)
+    thread.start()
+    bridge = bench.bridge()
+    bridge.start()
+
+    def ended() -> bool:
+        if bridge.state in {State.INITIALISING, State.CLOSING}:
+            time.sleep(0.01)  # a Python that is a little slow: events gather
+        return bridge.state is state
+
+    run_until(bridge, ended)
+    thread.join()
+    stopped(bridge)
+
+
+def test_a_bug_at_the_start_does_not_leave_the_process_behind(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def bug(*_args: object, **_options: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(bridge_module, "open_bus", bug)
+    bridge = bench.bridge()
+    with pytest.raises(ZeroDivisionError):
+        serve(bridge, None)
+    assert not bridge._thread.is_alive()

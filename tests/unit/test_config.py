@@ -292,6 +292,12 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "list": ("\n- a\n", [f"2:1: {NO_MAPPING}"]),
     "text": ("hello", [f"1:1: {NO_MAPPING}"]),
     "tagged": ("!!set {a, b}", [f"1:1: {NO_MAPPING}"]),
+    "window for a slow line": (
+        "adapter: {type: can232, port: /dev/ttyS0, baudrate: 2400}\nchannel: {bitrate: 125000}\n"
+        "bus: {channel: vcan0}\ntransmit: {window: 32}\n",
+        ["4:20: transmit.window: 32 frames take 3.6 s at 2400 Bd, more than half of the deadline of 1 s, "
+         "so they could be sent late; at most 4"],
+    ),
     "no sections": ("{}", [
         f"1:1: adapter: is missing; a section with {ADAPTER_KEYS} is wanted",
         f"1:1: channel: is missing; a section with {CHANNEL_KEYS} is wanted",
