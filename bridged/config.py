@@ -200,7 +200,7 @@ def _read_adapter(section: Section | None) -> AdapterConfig | None:
 
 
 def _window_problem(adapter: AdapterConfig, transmit: TransmitConfig) -> str | None:
-    """A window's frames lie in the line, where they grow old uncounted: 27 characters each at the most."""
+    """The frames of a window lie in the line, where they grow old uncounted: 27 characters each."""
     if transmit.window == 1 or "://" in adapter.port:
         return None
     frame_s = 27 * 10 / adapter.baudrate
