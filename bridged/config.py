@@ -208,8 +208,8 @@ def _window_problem(adapter: AdapterConfig, transmit: TransmitConfig) -> str | N
     if transmit.window <= room:
         return None
     return (
-        f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {adapter.baudrate} Bd, more than "
-        f"half of the deadline of {transmit.deadline_s:g} s, so they could be sent late; at most {room}"
+        f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {adapter.baudrate} Bd, "
+        f"more than half of the deadline of {transmit.deadline_s:g} s, so they could be sent late; at most {room}"
     )
 
 
