@@ -207,10 +207,9 @@ def _window_problem(adapter: AdapterConfig, transmit: TransmitConfig) -> str | N
     room = max(1, int(transmit.deadline_s / 2 / frame_s))
     if transmit.window <= room:
         return None
-    return (
-        f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {adapter.baudrate} Bd, "
-        f"more than half of the deadline of {transmit.deadline_s:g} s, so they could be sent late; at most {room}"
-    )
+    taken = f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {adapter.baudrate} Bd"
+    limit = f"more than half of the deadline of {transmit.deadline_s:g} s"
+    return f"{taken}, {limit}, so they could be sent late; at most {room}"
 
 
 def _port_problem(port: str) -> str | None:
