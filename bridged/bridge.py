@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 RECONNECT_INITIAL_S = 0.1
 RECONNECT_MAXIMUM_S = 5.0
-FAULT_RETRY_S = 30.0
+FAULT_RETRY_S = 5.0
 BUS_RETRY_S = 1.0
 REFUSED_LOG_INTERVAL_S = 10.0
 ABORT_WAIT_S = 0.1
@@ -69,6 +69,7 @@ class Bridge:
         self.config = config
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
+        self._told: set[str] = set()  # reasons in the log since it ran last
         self._bus_reason = ""  # why the bus is not open
         self.finished = False
         self.adapter = make_adapter(config, memory)
@@ -216,11 +217,21 @@ class Bridge:
         before = self.state
         self.state, actions = transition(before, event)
         if self.state is not before:
-            self.reason = reason
-            level = logging.WARNING if reason else logging.INFO
-            log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
+            self._log_transition(reason)
         for action in actions:
             self._perform(action)
+
+    def _log_transition(self, reason: str) -> None:
+        """Each cause once: retries that fail for the same one are not told again until it runs."""
+        self.reason = reason or (self.reason if self.state in {State.BACKOFF, State.FAULT} else "")
+        if self.state is State.RUNNING:
+            self._told.clear()
+        if reason and reason not in self._told:
+            log.warning("state=%s: %s", self.state.value, reason)
+            self._told.add(reason)
+        else:
+            level = logging.DEBUG if self._told else logging.INFO
+            log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
 
     def _perform(self, action: Action) -> None:
         match action:

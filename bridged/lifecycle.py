@@ -12,9 +12,10 @@ class State(enum.Enum):
     OPENING = "opening"  # the port is being opened
     INITIALISING = "initialising"  # the adapter is being identified and configured
     RUNNING = "running"  # frames are relayed
+    REJECTING = "rejecting"  # wrong device, or it refuses its configuration; the channel is closed
     CLOSING = "closing"  # something failed; the channel is closed before the next try
     BACKOFF = "backoff"  # waiting before the next try
-    FAULT = "fault"  # wrong device, or it refuses its configuration: tried again slowly
+    FAULT = "fault"  # after REJECTING: tried again slowly
     STOPPING = "stopping"  # told to stop; the channel is being closed
     STOPPED = "stopped"
 
@@ -55,7 +56,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.OPENING, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.INITIALISING, E.READY): (S.RUNNING, (A.RUN,)),
     (S.INITIALISING, E.UNANSWERED): (S.CLOSING, (A.CLOSE,)),
-    (S.INITIALISING, E.REFUSED): (S.FAULT, (A.RELEASE, A.WAIT_LONG)),
+    (S.INITIALISING, E.REFUSED): (S.REJECTING, (A.CLOSE,)),
     (S.INITIALISING, E.PORT_LOST): (S.BACKOFF, (A.RELEASE, A.WAIT)),
     (S.INITIALISING, E.STOP): (S.STOPPING, (A.CLOSE,)),
     (S.RUNNING, E.SILENT): (S.CLOSING, (A.CLOSE,)),
@@ -64,6 +65,9 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.CLOSING, E.CLOSED): (S.BACKOFF, (A.RELEASE, A.WAIT)),
     (S.CLOSING, E.PORT_LOST): (S.BACKOFF, (A.RELEASE, A.WAIT)),
     (S.CLOSING, E.STOP): (S.STOPPING, (A.CLOSE,)),
+    (S.REJECTING, E.CLOSED): (S.FAULT, (A.RELEASE, A.WAIT_LONG)),
+    (S.REJECTING, E.PORT_LOST): (S.FAULT, (A.RELEASE, A.WAIT_LONG)),
+    (S.REJECTING, E.STOP): (S.STOPPING, (A.CLOSE,)),
     (S.BACKOFF, E.TIMER): (S.OPENING, (A.OPEN,)),
     (S.BACKOFF, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.FAULT, E.TIMER): (S.OPENING, (A.OPEN,)),
@@ -76,7 +80,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
 
 # Late news, without meaning for the state they meet.
 IGNORED: frozenset[tuple[State, Event]] = frozenset(
-    [(S.CLOSING, E.SILENT), (S.STOPPING, E.SILENT), (S.STOPPING, E.STOP)]
+    [(S.CLOSING, E.SILENT), (S.REJECTING, E.SILENT), (S.STOPPING, E.SILENT), (S.STOPPING, E.STOP)]
     + [(S.BACKOFF, E.PORT_LOST), (S.FAULT, E.PORT_LOST)]  # came with the news that ended it
     + [(S.STOPPED, event) for event in (E.STOP, E.OPEN_FAILED, E.PORT_LOST)]
 )

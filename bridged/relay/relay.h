@@ -110,6 +110,7 @@ struct inflight {
     uint8_t prefix;
     uint32_t token;
     int64_t deadline_ns; /* of the answer */
+    uint64_t noise;      /* line_noise() when it was sent */
     struct tx_frame tx;
 };
 
@@ -173,6 +174,7 @@ struct relay {
     uint64_t poll_decoded; /* counters.decoded when the last poll was sent */
     bool polling, polled, resyncing, silent;
     bool checking; /* a refusal is not believed yet: INFLIGHT_CHECK is to be sent, or its answer to come */
+    uint64_t check_noise; /* line_noise() at the refusal that is being checked */
     bool doubtful; /* an answer may come late: settled before the first frame goes */
     uint32_t sync_tries;
     uint8_t out[OUT_BUFFER];

@@ -43,6 +43,12 @@ static struct tx_frame retry_pop(struct relay *r)
     return tx;
 }
 
+/* Grows with everything from the device that was no message, or one that nobody waits for. */
+static uint64_t line_noise(const struct relay *r)
+{
+    return r->count.skipped_bytes + r->count.stray_answers;
+}
+
 void transmit_drop(struct relay *r, enum tx_drop reason)
 {
     r->count.tx_dropped[reason]++;
@@ -169,12 +175,12 @@ static void frame_confirmed(struct relay *r, uint64_t number)
 
 /* BELL says that the adapter did not take the frame: sending it again cannot double it. But a BELL may
  * be noise, or a second answer to the frame before (slcanpty); so first the sync command goes, and if the
- * frame's own answer comes before that command's, the frame was taken after all. While the line is being
- * resynchronised BELL may mean something else (the sync command spliced to a broken
+ * frame's own answer comes before that command's, the frame was taken after all. Where there was noise
+ * that answer may be in it, so that nothing is certain. While the line is being resynchronised BELL may mean something else (the sync command spliced to a broken
  * one), and a frame sent twice is worse than one dropped and counted. */
-static void frame_refused(struct relay *r, const struct tx_frame *tx, int64_t now)
+static void frame_refused(struct relay *r, const struct tx_frame *tx, uint64_t noise, int64_t now)
 {
-    if (r->resyncing) {
+    if (r->resyncing || line_noise(r) != noise) {
         transmit_drop(r, TX_UNANSWERED);
         return;
     }
@@ -188,6 +194,8 @@ static void frame_refused(struct relay *r, const struct tx_frame *tx, int64_t no
     for (; i && retry_at(r, i - 1)->number > tx->number; i--)
         *retry_at(r, i) = *retry_at(r, i - 1);
     *retry_at(r, i) = *tx;
+    if (!r->checking)
+        r->check_noise = line_noise(r);
     r->checking = true;
     r->retry_at_ns = now + r->retry_delay_ns;
     r->retry_delay_ns *= r->retry_delay_ns < RETRY_LAST_NS ? 2 : 1;
@@ -209,7 +217,7 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
     switch (done.kind) {
     case INFLIGHT_FRAME:
         if (how == EVENT_REFUSED)
-            frame_refused(r, &done.tx, now);
+            frame_refused(r, &done.tx, done.noise, now);
         else
             frame_confirmed(r, done.tx.number);
         break;
@@ -222,6 +230,8 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
         break;
     case INFLIGHT_CHECK:
         r->checking = false;
+        for (; r->retry_count && line_noise(r) != r->check_noise; retry_pop(r))
+            transmit_drop(r, TX_UNANSWERED);
         break;
     case INFLIGHT_SYNC:
         r->resyncing = r->checking = false;
@@ -281,7 +291,7 @@ void transmit_answer(struct relay *r, const struct codec_message *msg, int64_t n
 static struct inflight *inflight_push(struct relay *r, enum inflight_kind kind, int64_t deadline_ns)
 {
     struct inflight *in = inflight_at(r, r->inflight_count++);
-    *in = (struct inflight){.kind = kind, .deadline_ns = deadline_ns};
+    *in = (struct inflight){.kind = kind, .deadline_ns = deadline_ns, .noise = line_noise(r)};
     return in;
 }
 

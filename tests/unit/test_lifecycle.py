@@ -14,6 +14,7 @@ POSSIBLE = {
     State.OPENING: {Event.OPENED, Event.OPEN_FAILED, Event.STOP},
     State.INITIALISING: {Event.READY, Event.UNANSWERED, Event.REFUSED, Event.PORT_LOST, Event.STOP},
     State.RUNNING: {Event.SILENT, Event.PORT_LOST, Event.STOP},
+    State.REJECTING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
     State.CLOSING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
     State.BACKOFF: {Event.TIMER, Event.PORT_LOST, Event.STOP},
     State.FAULT: {Event.TIMER, Event.PORT_LOST, Event.STOP},
