@@ -124,3 +124,24 @@ def test_times_that_are_none_are_refused(rig: Rig, seconds: float) -> None:
         rig.relay.command(1, b"F\r", 0, "F", seconds)
     with pytest.raises(ValueError, match="seconds"):
         rig.relay.set_polling(b"A\r", "A", seconds)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        pytest.param(b"\x8fx\r\a", b"V1324\r", id="noise before the BELL: the answer may be in it"),
+        pytest.param(b"\a", b"\x8fz\x01\rV1324\r", id="noise after it"),
+    ],
+)
+def test_a_bell_amid_noise_is_not_believed(rig: Rig, before: bytes, after: bytes) -> None:
+    rig.bus.send(can_frame(1))
+    rig.turn()
+    assert len(rig.said()) == 1
+    rig.port.send(before)
+    rig.turn()
+    rig.port.send(after)
+    rig.turn()
+    rig.turn(50)
+    assert [line for line in rig.said() if line != b"V"] == []
+    c = rig.counters()
+    assert (c["unanswered"], c["queued"], c["tx_retries"]) == (1, 0, 0)
