@@ -16,6 +16,7 @@ EVENT_REFUSED: Final[int]
 EVENT_TEXT: Final[int]
 EVENT_TIMEOUT: Final[int]
 EVENT_UNASKED: Final[int]
+EVENT_NOISE: Final[int]
 EVENT_FRAME_REFUSED: Final[int]
 EVENT_UNANSWERED: Final[int]
 EVENT_SILENT: Final[int]
@@ -28,8 +29,8 @@ WINDOW_MAX: Final[int]
 class Relay:
     """Relays frames between a port (bytes) and a bus (datagrams of struct can_frame).
 
-    Times are seconds. `window`: how many commands may be unanswered. `deadline`: a frame older than
-    this is not sent. `sync`: a command whose answer, a text that begins with `sync_prefix`, cannot be
+    Times are seconds. `window`: how many frames and commands may be unanswered. `deadline`: a frame
+    older than this is not sent. `sync`: a command whose answer, a text that begins with `sync_prefix`, cannot be
     taken for any other answer; sent to find the thread again after an answer was lost.
     Descriptors stay the caller's to close, after they were detached.
     Raises ValueError for settings out of range, OSError when descriptors or memory run out.
@@ -44,7 +45,7 @@ class Relay:
         deadline: float,
         answer_timeout: float,
         sync: bytes,
-        sync_prefix: str,
+        sync_prefix: bytes,
     ) -> Self: ...
     def run(self) -> None:
         """Relay until stop() is called, without the GIL. OSError(EBUSY): another thread does."""
@@ -60,9 +61,15 @@ class Relay:
     def detach_bus(self) -> None: ...
     def set_gates(self, *, receiving: bool, transmit: int) -> None:
         """Whether frames from the device go to the bus, and what happens to those from the bus."""
-    def set_polling(self, request: bytes, prefix: str, interval: float, /) -> None:
+    def set_polling(self, request: bytes, prefix: bytes, interval: float, /) -> None:
         """Ask the device for frames with `request` until the port is detached."""
-    def command(self, token: int, data: bytes, accept: int, prefix: str, timeout: float) -> None:
+    def set_flow(self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int) -> None:
+        """For a device that does not answer frames: `ask` follows them, its answer confirms them.
+
+        `capacity`, `critical`, `ready`: frames that its transmit buffer holds, and above and below which it
+        says "stop" and "go". Until this is called no frame is sent; it ends when the port is detached.
+        """
+    def command(self, token: int, data: bytes, accept: int, prefix: bytes, timeout: float) -> None:
         """Send a command at the next message boundary; an event with `token` always follows."""
     def events(self) -> list[tuple[int, int, bytes]]:
         """What happened since the last call: (EVENT_…, token, text)."""

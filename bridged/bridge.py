@@ -84,6 +84,8 @@ class Bridge:
         self._tokens = itertools.count(1)
         self._pending: dict[int, Callable[[Answer], None]] = {}
         self._refused_log_at = 0.0
+        self._report = ""  # the last in the log
+        self._report_log_at = 0.0
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         sync = self.adapter.sync
@@ -94,7 +96,7 @@ class Bridge:
             deadline=config.transmit.deadline_s,
             answer_timeout=self.adapter.answer_timeout_s,
             sync=sync.request,
-            sync_prefix=sync.text,
+            sync_prefix=sync.prefix,
         )
         self._thread = threading.Thread(target=self._relay.run, name="relay")
 
@@ -238,7 +240,8 @@ class Bridge:
             case Action.OPEN:
                 threading.Thread(target=self._open_port, name="open", daemon=True).start()
             case Action.INITIALISE:
-                self._run_steps(self.adapter.init_steps())
+                assert self._port is not None
+                self._run_steps(self.adapter.init_steps(self._port.serial_number))
             case Action.RUN:
                 self._run()
             case Action.CLOSE:
@@ -253,10 +256,9 @@ class Bridge:
                 self._finish()
 
     def _open_port(self) -> None:
-        adapter = self.config.adapter
         result: Port | Exception
         try:
-            result = open_port(adapter.port, adapter.baudrate)
+            result = open_port(self.config.adapter.port, self.adapter.baudrate)
         except Exception as error:  # noqa: BLE001 - a bug is raised again in the thread that can end the bridge
             result = error
         self._opened.put(result)
@@ -277,7 +279,12 @@ class Bridge:
         self._backoff.reset()
         if self.adapter.polling is not None:
             polling = self.adapter.polling
-            self._relay.set_polling(polling.request, polling.text, polling.interval_s)
+            self._relay.set_polling(polling.request, polling.prefix, polling.interval_s)
+        if self.adapter.flow is not None:
+            flow = self.adapter.flow
+            self._relay.set_flow(
+                flow.request, flow.prefix, capacity=flow.capacity, critical=flow.critical, ready=flow.ready
+            )
         listen_only = self.config.channel.listen_only
         gate = _relay.GATE_LISTEN_ONLY if listen_only else _relay.GATE_OPEN
         self._relay.set_gates(receiving=True, transmit=gate)
@@ -316,7 +323,7 @@ class Bridge:
             self._thread.join()
         if self._port is not None:
             with contextlib.suppress(OSError):
-                os.write(self._port.fd, 2 * next(self.adapter.close_steps()).request)
+                os.write(self._port.fd, self.adapter.last_words)
                 time.sleep(ABORT_WAIT_S)  # close() throws away what is not out yet
             self._port.close()
             self._port = None
@@ -333,7 +340,7 @@ class Bridge:
         self._pending[token] = then
         replies = exchange.accept + exchange.reject
         accept = sum(ACCEPT.get(reply, 0) for reply in set(replies))
-        self._relay.command(token, exchange.request, accept, exchange.text, exchange.timeout_s)
+        self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s)
 
     def _run_steps(self, steps: Steps) -> None:
         """Performs them one after the other; a step that was under way is forgotten, its answer awaited."""
@@ -375,7 +382,7 @@ class Bridge:
         if kind in REPLIES:
             then = self._pending.pop(token, None)
             if then is not None:
-                then(Answer(REPLIES[kind], text.decode("ascii", "replace")))
+                then(Answer(REPLIES[kind], text))
         elif kind == _relay.EVENT_PORT_LOST:
             failure = self._port.failure if self._port else None
             self._dispatch(
@@ -393,8 +400,18 @@ class Bridge:
             log.warning("interface %s is down", self.config.bus.channel)
         elif kind == _relay.EVENT_BUS_LOST:
             self._on_bus_lost(token)
+        elif kind == _relay.EVENT_NOISE:
+            self.adapter.saw_noise(text)
         else:
-            log.debug("adapter said %r unasked", text)
+            self._on_report(text)
+
+    def _on_report(self, text: bytes) -> None:
+        description = self.adapter.describe_report(text)
+        log.debug("adapter said %r unasked", text)
+        now = time.monotonic()
+        if description and (description != self._report or now >= self._report_log_at):
+            self._report, self._report_log_at = description, now + REFUSED_LOG_INTERVAL_S
+            log.warning("adapter reports: %s", description)
 
     def _on_frame_refused(self) -> None:
         """Asks why (manual 1.4: F after an error answer)."""

@@ -17,6 +17,19 @@ CAN232_STANDARD_BITRATES = {
 }
 """bit/s → command (CAN232 manual, `Sn`). Some clones set 750 kbit/s for S7."""
 
+_STANDARD_REGISTERS = {
+    10_000: (0x31, 0x1C),
+    20_000: (0x18, 0x1C),
+    50_000: (0x09, 0x1C),
+    100_000: (0x04, 0x1C),
+    125_000: (0x03, 0x1C),
+    250_000: (0x01, 0x1C),
+    500_000: (0x00, 0x1C),
+    800_000: (0x00, 0x16),
+    1_000_000: (0x00, 0x14),
+}
+"""bit/s → BTR0 and BTR1 of the same bit rates for a crystal of 16 MHz (CiA's table)."""
+
 MAX_BITRATE = 1_000_000
 """bit/s, the limit of classic CAN (ISO 11898-1)."""
 
@@ -46,6 +59,11 @@ class BitTiming(NamedTuple):
         if self.registers is None:
             return f"{self.bitrate} bit/s"
         return f"{self.bitrate} bit/s by BTR0 0x{self.registers[0]:02X}, BTR1 0x{self.registers[1]:02X}"
+
+    @property
+    def register_pair(self) -> tuple[int, int]:
+        """BTR0 and BTR1, also of a bit rate that some adapters have a command for: (0x03, 0x1C)."""
+        return self.registers or _STANDARD_REGISTERS[self.bitrate]
 
     def can232_command(self) -> bytes:
         r"""`S4\r` or `s031C\r` (CAN232 manual, S and s)."""

@@ -90,8 +90,9 @@ def _log_to_stderr(name: str, *, verbose: bool) -> None:
 def _check(args: argparse.Namespace) -> int:
     config = _load(args.config)
     adapter, channel, bus = config.adapter, config.channel, config.bus
+    rate = f" at {adapter.baudrate} Bd" if adapter.type == "can232" else ""
     print(
-        f"{config.path}: good: {adapter.type} on {adapter.port} at {adapter.baudrate} Bd, "
+        f"{config.path}: good: {adapter.type} on {adapter.port}{rate}, "
         f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
         f"to {bus.interface} {bus.channel}"
     )
@@ -152,12 +153,15 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
     status.add_argument("--socket", metavar="PATH", help="the status socket, if not at its usual place")
     status.add_argument("--json", action="store_true")
 
-    simulate = add("simulate", "Simulate an adapter on a pseudo terminal.", _simulate)
+    simulate = add(
+        "simulate", "Simulate an adapter on a pseudo terminal, or on a line that is there.", _simulate
+    )
     if command == "simulate":
-        from bridged.simulators import serve  # noqa: PLC0415
+        from bridged.simulators import commands as simulators  # noqa: PLC0415
 
         kinds = simulate.add_subparsers(dest="kind", required=True, metavar="ADAPTER")
-        serve.add_arguments(kinds.add_parser("can232", help="LAWICEL CAN232"))
+        for adapter, text in simulators.ADAPTERS.items():
+            simulators.add_arguments(kinds.add_parser(adapter, help=text), adapter)
 
     demo = add("demo", "Show a simulated adapter at work on a CAN interface.", _demo)
     if command == "demo":
@@ -168,9 +172,9 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from bridged.simulators import serve  # noqa: PLC0415
+    from bridged.simulators import commands  # noqa: PLC0415
 
-    return serve.run(args)
+    return commands.run(args)
 
 
 def _demo(args: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -22,8 +22,12 @@ from bridged.yaml_source import (
     scalar_value,
 )
 
+CRITICAL_LIMIT, READY_LIMIT = 15, 7
+"""Frames. Known to work, and with the fewest ERROR messages of the pairs that were tried on a real one."""
+
 # --- The schema. A description completes "… is wanted, not the text 'fast'". ----------------------
 
+ADAPTER_TYPES = Meta(description="can232 or usb2can")
 Flag = Annotated[bool, Meta(description="true or false")]
 Port = Annotated[
     str, Meta(min_length=1, description="a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT")
@@ -32,6 +36,8 @@ Baudrate = Annotated[int, Meta(ge=50, le=4_000_000, description="a UART rate fro
 SerialNumber = Annotated[
     str, Meta(pattern="^[!-~]{1,32}$", description="the serial number that the device reports")
 ]
+CriticalLimit = Annotated[int, Meta(ge=1, le=18, description="a number of frames from 1 to 18")]
+ReadyLimit = Annotated[int, Meta(ge=0, le=17, description="a number of frames from 0 to 17")]
 Bitrate = Annotated[
     int,
     Meta(
@@ -56,13 +62,43 @@ Window = Annotated[int, Meta(ge=1, le=32, description="a number of unanswered fr
 Deadline = Annotated[float, Meta(gt=0, le=3600, description="a number of seconds above 0 and up to 3600")]
 
 
-class AdapterConfig(Struct, frozen=True, kw_only=True):
-    """The device, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s."""
+class _AdapterKeys(Struct, frozen=True, kw_only=True):
+    type: Annotated[Literal["can232", "usb2can"], ADAPTER_TYPES]
+    port: Port
+    baudrate: Baudrate | None = None
+    serial_number: SerialNumber | None = None
+    critical_limit: CriticalLimit | None = None
+    ready_limit: ReadyLimit | None = None
 
-    type: Annotated[Literal["can232"], Meta(description="can232")]
+
+class Can232Config(Struct, frozen=True, kw_only=True):
+    """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s."""
+
+    default_window: ClassVar[int] = 1
+
+    type: Annotated[Literal["can232"], ADAPTER_TYPES]
     port: Port
     baudrate: Baudrate = 57_600
     serial_number: SerialNumber | None = None
+
+
+class Usb2canConfig(Struct, frozen=True, kw_only=True):
+    """A USB2CAN, and how to reach it. `port` is an absolute path, socket:// or usb://VID:PID[/SERIAL].
+
+    With so many frames in its transmit buffer the adapter says stop (`critical_limit`) and go on
+    (`ready_limit`, always below): USB2CAN document, COMMAND 0 and 1. `serial_number` is the USB device's.
+    """
+
+    default_window: ClassVar[int] = 16
+
+    type: Annotated[Literal["usb2can"], ADAPTER_TYPES]
+    port: Port
+    serial_number: SerialNumber | None = None
+    critical_limit: CriticalLimit = CRITICAL_LIMIT
+    ready_limit: ReadyLimit = READY_LIMIT
+
+
+AdapterConfig: TypeAlias = Can232Config | Usb2canConfig
 
 
 class _AcceptanceKeys(Struct, frozen=True, kw_only=True):
@@ -100,12 +136,18 @@ class BusConfig(_BusKeys, frozen=True, kw_only=True):
     options: dict[str, Any] = {}
 
 
+class _TransmitKeys(Struct, frozen=True, kw_only=True):
+    queue: QueueLength = 1024
+    window: Window | None = None
+    deadline_s: Deadline = msgspec.field(default=1.0, name="deadline")
+
+
 class TransmitConfig(Struct, frozen=True, kw_only=True):
     """How frames wait for the adapter: `queue` and `window` in frames; dropped after `deadline_s`."""
 
-    queue: QueueLength = 1024
-    window: Window = 1
-    deadline_s: Deadline = msgspec.field(default=1.0, name="deadline")
+    queue: int
+    window: int
+    deadline_s: float
 
 
 class Config(Struct, frozen=True, kw_only=True):
@@ -120,11 +162,27 @@ class Config(Struct, frozen=True, kw_only=True):
 
 
 _SECTIONS: dict[str, type[Struct]] = {
-    "adapter": AdapterConfig,
+    "adapter": _AdapterKeys,
     "channel": _ChannelKeys,
     "channel.acceptance": _AcceptanceKeys,
     "bus": _BusKeys,
-    "transmit": TransmitConfig,
+    "transmit": _TransmitKeys,
+}
+
+_ADAPTERS: dict[str, type[AdapterConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
+
+_KEYS_OF_OTHERS = {
+    "can232": {
+        "critical_limit": "goes with type: usb2can; remove it",
+        "ready_limit": "goes with type: usb2can; remove it",
+    },
+    "usb2can": {"baudrate": "a FT245 has no baud rate: remove it"},
+}
+
+_SCHEMES = {"can232": ("socket", "rfc2217"), "usb2can": ("socket", "usb")}
+_SCHEMES_OF_OTHERS = {
+    "rfc2217": "rfc2217:// sets the baud rate of a serial line, and a FT245 has none; write socket://",
+    "usb": "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0",
 }
 
 _RESERVED_OPTIONS = {
@@ -139,6 +197,9 @@ _ADDRESS = re.compile(
     rf"(?:{_LABEL}(?:\.{_LABEL})*\.?|\[[0-9A-Fa-f:.]+(?:%[\w.-]+)?\]):([0-9]{{1,5}})/?(?:\?\S*)?", re.ASCII
 )
 """HOST:PORT, [IPv6]:PORT, with pyserial's options: nas.local:4001, [fe80::1%eth0]:4001, h:1?logging=debug."""
+
+_USB_DEVICE = re.compile(r"[0-9A-Fa-f]{4}:[0-9A-Fa-f]{4}(?:/([!-~]{1,32}))?")
+"""VID:PID or VID:PID/SERIAL: 0403:6001, 0403:6001/A6008isP."""
 
 
 def load(path: str | os.PathLike[str]) -> Config:
@@ -164,17 +225,12 @@ def _read_file(path: Path, top: Section) -> Config | None:
     channel_section = top.section("channel")
     channel = _read_channel(channel_section)
     bus = _read_bus(top.section("bus"))
-    transmit: TransmitConfig | None = TransmitConfig()
-    if "transmit" in top.nodes:
-        transmit_section = top.section("transmit", required=False)
-        transmit = _read_plain(transmit_section, TransmitConfig)
-        if adapter and transmit and transmit_section and (text := _window_problem(adapter, transmit)):
-            transmit_section.refuse_value("window", text)
-        if channel_section and channel_section.values.get("listen_only"):
-            top.refuse_key(
-                "transmit",
-                "nothing is sent with channel.listen_only: true; remove this section, or listen_only",
-            )
+    transmit_section = top.section("transmit", required=False) if "transmit" in top.nodes else None
+    transmit = _read_transmit(transmit_section, adapter)
+    if "transmit" in top.nodes and channel_section and channel_section.values.get("listen_only"):
+        top.refuse_key(
+            "transmit", "nothing is sent with channel.listen_only: true; remove this section, or listen_only"
+        )
     if top.problems or not (adapter and channel and bus and transmit):
         return None
     return Config(name=path.stem, path=path, adapter=adapter, channel=channel, bus=bus, transmit=transmit)
@@ -193,13 +249,71 @@ def _read_plain(section: Section | None, schema: type[_S]) -> _S | None:
 
 
 def _read_adapter(section: Section | None) -> AdapterConfig | None:
-    adapter = _read_plain(section, AdapterConfig)
-    if section and (text := _port_problem(section.values.get("port", "/"))):
+    if section is None:
+        return None
+    node = section.nodes.get("type")
+    type_: str | None = node.value if isinstance(node, ScalarNode) and node.value in _ADAPTERS else None
+    adapter: AdapterConfig | None = None
+    if type_ is None:
+        section.read(_AdapterKeys)
+    else:
+        for key, why in _KEYS_OF_OTHERS[type_].items():
+            if key in section.keys:
+                section.refuse_key(key, why)
+                del section.keys[key]  # or it would be reported as unknown too
+        adapter = _read_plain(section, _ADAPTERS[type_])
+    if text := _port_problem(section.values.get("port", "/"), type_):
         section.refuse_value("port", text)
+    if type_ == "usb2can":
+        _check_serial_number(section)
+        _check_limits(section)
     return adapter
 
 
-def _window_problem(adapter: AdapterConfig, transmit: TransmitConfig) -> str | None:
+def _check_serial_number(section: Section) -> None:
+    """Report one that could not be kept to: a USB2CAN has no command that tells it, only USB knows it."""
+    serial_number = section.values.get("serial_number")
+    scheme, _, device = section.values.get("port", "").partition("://")
+    if serial_number is None:
+        return
+    if scheme == "socket":
+        section.refuse_key("serial_number", "is the USB device's, unknown through socket://; remove it")
+    match = _USB_DEVICE.fullmatch(device)
+    if scheme == "usb" and match and match[1] not in (None, serial_number):
+        text = f"{quoted(serial_number)} is not the one in port, {quoted(match[1])}; remove one of them"
+        section.refuse_value("serial_number", text)
+
+
+def _check_limits(section: Section) -> None:
+    """Report limits that would have the adapter say go on before it says stop."""
+    given = [key for key in ("critical_limit", "ready_limit") if key in section.nodes]
+    if any(key not in section.values for key in given):  # reported already
+        return
+    critical = section.values.get("critical_limit", CRITICAL_LIMIT)
+    ready = section.values.get("ready_limit", READY_LIMIT)
+    if ready < critical:
+        return
+    default = ", its default" if len(given) == 1 else ""
+    if "ready_limit" in given:
+        text = f"a limit below critical_limit ({critical}{default}) is wanted, not {ready}"
+    else:
+        text = f"a limit above ready_limit ({ready}{default}) is wanted, not {critical}"
+    section.refuse_value(given[-1], text)
+
+
+def _read_transmit(section: Section | None, adapter: AdapterConfig | None) -> TransmitConfig | None:
+    """Read `transmit`; without the section, and for what it leaves out, its defaults."""
+    keys = _read_plain(section, _TransmitKeys) or _TransmitKeys()
+    if adapter is None:
+        return None
+    window = adapter.default_window if keys.window is None else keys.window
+    transmit = TransmitConfig(queue=keys.queue, window=window, deadline_s=keys.deadline_s)
+    if section and isinstance(adapter, Can232Config) and (text := _window_problem(adapter, transmit)):
+        section.refuse_value("window", text)
+    return transmit
+
+
+def _window_problem(adapter: Can232Config, transmit: TransmitConfig) -> str | None:
     """The frames of a window lie in the line, where they grow old uncounted: 27 characters each."""
     if transmit.window == 1 or "://" in adapter.port:
         return None
@@ -212,14 +326,24 @@ def _window_problem(adapter: AdapterConfig, transmit: TransmitConfig) -> str | N
     return f"{taken}, {limit}, so they could be sent late; at most {room}"
 
 
-def _port_problem(port: str) -> str | None:
+def _port_problem(port: str, adapter_type: str | None) -> str | None:
+    """What is wrong with a port for this type of adapter; None as the type: for any."""
     scheme, separator, rest = port.partition("://")
     if not separator:
         if port.startswith("/"):
             return None
         return f"a device path begins with '/', such as /dev/ttyUSB0; {quoted(port)} does not"
-    if scheme not in ("socket", "rfc2217"):
-        return f"the URL of a port begins with socket:// or rfc2217://, not {quoted(scheme + separator)}"
+    schemes = ("socket", "rfc2217", "usb") if adapter_type is None else _SCHEMES[adapter_type]
+    if scheme not in schemes:
+        if text := _SCHEMES_OF_OTHERS.get(scheme):
+            return text
+        wanted = " or ".join(f"{name}://" for name in schemes)
+        return f"the URL of a port begins with {wanted}, not {quoted(scheme + separator)}"
+    if scheme == "usb":
+        if _USB_DEVICE.fullmatch(rest):
+            return None
+        wanted = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, is wanted"
+        return f"{wanted}, not {quoted(port)}"
     address = _ADDRESS.fullmatch(rest)
     if not address or not 1 <= int(address[1]) <= 65_535:
         return f"{scheme}://HOST:PORT with a PORT from 1 to 65535 is wanted, not {quoted(port)}"

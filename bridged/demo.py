@@ -21,12 +21,13 @@ import can
 
 from bridged.bridge import Bridge
 from bridged.buses.socketcan import open_socketcan
-from bridged.config import Config, load
+from bridged.config import load
 from bridged.errors import BusError
 from bridged.memory import FileMemory
 from bridged.service import serve
 from bridged.simulators.can232 import Can232
-from bridged.simulators.serve import Simulator, positive
+from bridged.simulators.commands import ADAPTERS, STOP_GRACE_S, positive
+from bridged.simulators.serve import Device, Simulator
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
@@ -38,9 +39,8 @@ UART_RATE = 115_200
 STATUS_INTERVAL_S = 1.0
 CONFIG = """\
 adapter:
-  type: can232
-  port: {port}
-  baudrate: {baudrate}
+  type: {adapter}
+  port: {port}{baudrate}
 channel:
   bitrate: 125000
 bus:
@@ -51,6 +51,9 @@ bus:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `can-bridge demo`."""
+    parser.add_argument(
+        "adapter", nargs="?", choices=list(ADAPTERS), default="can232", help="which one; default: can232"
+    )
     parser.add_argument("--duration", type=positive, default=10.0, metavar="SECONDS", help="default: 10")
     parser.add_argument(
         "--rate", type=positive, default=5.0, metavar="FPS", help="frames a second each way; default: 5"
@@ -130,12 +133,13 @@ def _interface() -> tuple[str, str]:
     return "socketcan", CHANNEL
 
 
-def _load(folder: Path, simulator: Simulator, interface: str, channel: str) -> Config:
-    path = folder / "demo.yaml"
-    path.write_text(
-        CONFIG.format(port=simulator.port, baudrate=UART_RATE, interface=interface, channel=channel)
-    )
-    return load(path)
+def _make_device(adapter: str) -> tuple[Device, str]:
+    """The device that is simulated, and the line of its configuration that says the rate of its UART."""
+    if adapter == "can232":
+        return Can232(time.monotonic(), uart=Uart(UART_RATE)), f"\n  baudrate: {UART_RATE}"
+    from bridged.simulators.usb2can import Usb2can  # noqa: PLC0415 - only the adapter in use is loaded
+
+    return Usb2can(time.monotonic(), stop_grace_s=STOP_GRACE_S), ""
 
 
 class _Watch(threading.Thread):
@@ -186,14 +190,24 @@ def _end_serving() -> None:
 
 def run(args: argparse.Namespace) -> int:
     """The demo; 0 if frames went both ways."""
-    device = Can232(time.monotonic(), uart=Uart(UART_RATE))
+    device, baudrate = _make_device(args.adapter)
     simulator = Simulator(device, traffic_fps=args.rate)
-    print(f"# Simulated CAN232 on {simulator.port} at {UART_RATE} Bd, bit rate 125 kbit/s.")
+    rate = f" at {UART_RATE} Bd" if baudrate else ""
+    print(f"# Simulated {args.adapter.upper()} on {simulator.port}{rate}, bit rate 125 kbit/s.")
     thread = threading.Thread(target=simulator.run)
     interface, channel = _interface()
     with tempfile.TemporaryDirectory() as folder:
-        config = _load(Path(folder), simulator, interface, channel)
-        bridge = Bridge(config, FileMemory(Path(folder)))
+        path = Path(folder, "demo.yaml")
+        path.write_text(
+            CONFIG.format(
+                adapter=args.adapter,
+                port=simulator.port,
+                baudrate=baudrate,
+                interface=interface,
+                channel=channel,
+            )
+        )
+        bridge = Bridge(load(path), FileMemory(Path(folder)))
         program = Program(interface, channel, args.rate)
         watch = _Watch(bridge, program, args.duration)
         thread.start()

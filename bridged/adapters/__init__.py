@@ -10,7 +10,12 @@ if TYPE_CHECKING:
 
 
 def make_adapter(config: Config, memory: Memory) -> Adapter:
-    """The adapter that the configuration names."""
-    from bridged.adapters.can232 import Can232  # noqa: PLC0415 - only the adapter in use is loaded
+    """The adapter that the configuration names; only its module is loaded."""
+    adapter = config.adapter
+    if adapter.type == "usb2can":
+        from bridged.adapters.usb2can import Usb2can  # noqa: PLC0415
 
-    return Can232(config.adapter, config.channel, memory)
+        return Usb2can(adapter, config.channel, memory)
+    from bridged.adapters.can232 import Can232  # noqa: PLC0415
+
+    return Can232(adapter, config.channel, memory)

@@ -13,7 +13,7 @@ class Reply(enum.Enum):
 
     OK = enum.auto()
     REFUSED = enum.auto()
-    TEXT = enum.auto()  # a line that begins with Exchange.text
+    TEXT = enum.auto()  # one that begins with Exchange.prefix
     NONE = enum.auto()  # nothing, until Exchange.timeout_s
 
 
@@ -25,7 +25,7 @@ class Exchange:
     purpose: str  # completes "the adapter refused to …", "the adapter did not answer the request to …"
     accept: tuple[Reply, ...]
     reject: tuple[Reply, ...] = (Reply.REFUSED, Reply.NONE)
-    text: str = ""  # first character of the text that answers
+    prefix: bytes = b""  # how the text that answers begins
     advice: str = ""  # what the user can do when it is rejected
     timeout_s: float = 0.5
 
@@ -35,7 +35,7 @@ class Answer:
     """What came back for an exchange."""
 
     reply: Reply
-    text: str = ""
+    text: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,19 @@ class Polling:
     """A device that does not speak by itself is asked for frames this often."""
 
     request: bytes
-    text: str
+    prefix: bytes
     interval_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """How the window of a device works that does not answer frames: see Relay.set_flow."""
+
+    request: bytes
+    prefix: bytes
+    capacity: int  # these in frames of its transmit buffer
+    critical: int
+    ready: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +80,19 @@ class Adapter(Protocol):
     """One kind of device. bridge.py performs the steps, in order, each with its deadline."""
 
     codec: str
+    baudrate: int  # of a serial line, bit/s
     sync: Exchange  # its answer cannot be taken for any other
     answer_timeout_s: float  # for the answer to a frame
     identity: Identity
-    polling: Polling | None  # known after init_steps
+    polling: Polling | None  # known after init_steps, as is
+    flow: Flow | None  # None: the device answers each frame
+    last_words: bytes  # close the channel, where no time is left to await answers
 
-    def init_steps(self) -> Steps:
-        """From whatever state to an open channel. Raises AdapterError for a device that will not do."""
+    def init_steps(self, serial_number: str | None) -> Steps:
+        """From whatever state to an open channel. Raises AdapterError for a device that will not do.
+
+        `serial_number` is that of the USB device which is the port, None if it has none.
+        """
 
     def close_steps(self) -> Steps:
         """From whatever state to a closed channel; the steps accept every answer."""
@@ -88,3 +105,9 @@ class Adapter(Protocol):
 
     def saw_time_stamps(self) -> None:
         """Frames with time stamps came, which nobody asked for."""
+
+    def saw_noise(self, noise: bytes) -> None:
+        """Bytes that mean nothing came while the adapter is being initialised."""
+
+    def describe_report(self, text: bytes) -> str | None:
+        """What the device said unasked, for a log line; None if there is nothing to it."""

@@ -6,13 +6,13 @@ import logging
 import re
 from typing import TYPE_CHECKING
 
-from bridged.adapters.base import Answer, Exchange, Identity, Memory, Polling, Reply, Steps
+from bridged.adapters.base import Answer, Exchange, Flow, Identity, Memory, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
 
 if TYPE_CHECKING:
     from collections.abc import Generator
 
-    from bridged.config import AdapterConfig, ChannelConfig
+    from bridged.config import Can232Config, ChannelConfig
 
 log = logging.getLogger(__name__)
 
@@ -47,10 +47,12 @@ class Can232:
     """Sans-I/O: what to say to a CAN232. `identity` and `polling` hold what init_steps found out."""
 
     codec = "can232"
+    flow: Flow | None = None
+    last_words = b"C\rC\r"
 
-    def __init__(self, adapter: AdapterConfig, channel: ChannelConfig, memory: Memory) -> None:
+    def __init__(self, adapter: Can232Config, channel: ChannelConfig, memory: Memory) -> None:
         self._port = adapter.port
-        self._baudrate = adapter.baudrate
+        self.baudrate = adapter.baudrate
         self._wanted_serial = adapter.serial_number
         self._channel = channel
         self._memory = memory
@@ -59,7 +61,7 @@ class Can232:
         self.polling: Polling | None = None
         # An answer may stand behind a full receive FIFO on the line: 10 bit times a character.
         self.answer_timeout_s = 0.2 + RECEIVE_FIFO * LONGEST_LINE * 10 / adapter.baudrate
-        self.sync = self._step(b"V\r", "tell its version", (TEXT,), (NONE,), text="V")
+        self.sync = self._step(b"V\r", "tell its version", (TEXT,), (NONE,), prefix=b"V")
 
     def _step(
         self,
@@ -68,14 +70,14 @@ class Can232:
         accept: tuple[Reply, ...] = (OK,),
         reject: tuple[Reply, ...] = (REFUSED, NONE),
         *,
-        text: str = "",
+        prefix: bytes = b"",
         advice: str = "",
     ) -> Exchange:
-        return Exchange(request, purpose, accept, reject, text, advice, self.answer_timeout_s)
+        return Exchange(request, purpose, accept, reject, prefix, advice, self.answer_timeout_s)
 
     # --- start and end ------------------------------------------------------------------------
 
-    def init_steps(self) -> Steps:
+    def init_steps(self, serial_number: str | None) -> Steps:  # noqa: ARG002 - it has one of its own (N)
         """Flush, close, identify, configure, open (manual 1.4), then mend what its EEPROM has wrong."""
         self.polling = None
         yield from self._flush()
@@ -92,7 +94,7 @@ class Can232:
             auto_poll = auto_poll or (yield from self._auto_poll())
         if not auto_poll:
             log.info("firmware without auto poll: asking for frames with A every %g s", POLL_INTERVAL_S)
-            self.polling = Polling(b"A\r", "A", POLL_INTERVAL_S)
+            self.polling = Polling(b"A\r", b"A", POLL_INTERVAL_S)
 
     def close_steps(self) -> Steps:
         """`C` until it is certain: the first may end a half command or meet an old answer."""
@@ -104,7 +106,7 @@ class Can232:
     def _flush(self) -> Steps:
         """Lone CRs, as the manual wants them, only once the channel is closed: on an open one some
         clones answer them by sending their last frame again."""
-        yield self._step(FLUSH, "drop a half-typed command", ANYTHING, (), text="V")
+        yield self._step(FLUSH, "drop a half-typed command", ANYTHING, (), prefix=b"V")
         yield from self._close()
         yield self._step(b"\r\r", "empty its command buffer", ANYTHING, ())
 
@@ -113,22 +115,22 @@ class Can232:
 
     def _identify(self) -> Steps:
         for _ in range(3):
-            answer = yield self._step(b"V\r", "tell its version", (TEXT, NONE), (), text="V")
+            answer = yield self._step(b"V\r", "tell its version", (TEXT, NONE), (), prefix=b"V")
             if answer.reply is TEXT:
                 break
         else:
             msg = (
-                f"no answer to V on {self._port} at {self._baudrate} Bd: is the adapter powered "
+                f"no answer to V on {self._port} at {self.baudrate} Bd: is the adapter powered "
                 f"(from the CAN side, 6-16 V), the baud rate right (its LEDs blink it at power-on), "
                 f"the cable plugged?"
             )
             raise AdapterError(msg)
-        if not re.fullmatch("V[0-9A-F]{4}", answer.text):
-            msg = f"the device on {self._port} answers V with {answer.text!r}: not a CAN232 (Vhhss)"
+        version = answer.text.decode("ascii", "replace")
+        if not re.fullmatch("V[0-9A-F]{4}", version):
+            msg = f"the device on {self._port} answers V with {version!r}: not a CAN232 (Vhhss)"
             raise WrongDeviceError(msg)
-        version = answer.text
-        answer = yield self._step(b"N\r", "tell its serial number", (TEXT, REFUSED, NONE), (), text="N")
-        serial = answer.text[1:] if answer.reply is TEXT else None
+        answer = yield self._step(b"N\r", "tell its serial number", (TEXT, REFUSED, NONE), (), prefix=b"N")
+        serial = answer.text[1:].decode("ascii", "replace") if answer.reply is TEXT else None
         self.identity = Identity(version, serial)
         if self._wanted_serial is not None and serial != self._wanted_serial:
             msg = (
@@ -204,17 +206,17 @@ class Can232:
 
     def _auto_poll(self) -> Generator[Exchange, Answer, bool]:
         """Whether frames come by themselves: then A is refused (manual 2.0, A). X cannot be read."""
-        answer = yield self._step(b"A\r", "tell whether it polls", (TEXT, REFUSED, NONE), (), text="A")
+        answer = yield self._step(b"A\r", "tell whether it polls", (TEXT, REFUSED, NONE), (), prefix=b"A")
         return answer.reply is not TEXT
 
     # --- health -------------------------------------------------------------------------------
 
     def status_request(self) -> Exchange:
         """`F`; reading clears the flags: they say what happened since the last time."""
-        return self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), text="F")
+        return self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F")
 
     def describe_status(self, answer: Answer) -> str:
-        if not re.fullmatch("F[0-9A-Fa-f]{2}", answer.text):
+        if not re.fullmatch(b"F[0-9A-Fa-f]{2}", answer.text):
             return "unknown"
         flags = int(answer.text[1:], 16)
         return ", ".join(text for bit, text in STATUS_FLAGS.items() if flags >> bit & 1) or "no flags"
@@ -225,3 +227,9 @@ class Can232:
         self._stamped = True
         self._remember("Z", 1)
         log.warning("adapter sends time stamps (Z1), a sixth of its line; switched off at the next start")
+
+    def saw_noise(self, noise: bytes) -> None:
+        """A wrong baud rate is noticed by the answers that are missing."""
+
+    def describe_report(self, text: bytes) -> str | None:  # noqa: ARG002 - it never speaks unasked
+        return None

@@ -16,6 +16,7 @@ class Port(Protocol):
 
     fd: int
     description: str
+    serial_number: str | None  # of the USB device that the port is; None: there is none, or it has none
     failure: BridgeError | None  # why `fd` came to its end, where the descriptor itself cannot tell
 
     def close(self) -> None:
@@ -23,10 +24,14 @@ class Port(Protocol):
 
 
 def open_port(port: str, baudrate: int) -> Port:
-    """Open a tty by its path or a pyserial URL, `baudrate` in bit/s.
+    """Open a tty by its path, a USB device by `usb://VID:PID[/SERIAL]`, or a pyserial URL.
 
-    Raises PortError, with what to do about it.
+    `baudrate` in bit/s; a USB FIFO has none. Raises PortError, with what to do about it.
     """
+    if port.startswith("usb://"):
+        from bridged.ports.usb import open_usb  # noqa: PLC0415 - libusb only where a port needs it
+
+        return open_usb(port)
     from bridged.ports.serial import open_serial  # noqa: PLC0415 - pyserial only where a port is opened
 
     return open_serial(port, baudrate)

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import grp
+import logging
 import os
 import pwd
 import socket
@@ -19,10 +20,12 @@ from urllib.parse import urlsplit
 import serial
 
 from bridged.errors import BridgeError, PortError
+from bridged.ports import sysfs
 from bridged.pump import POLL_INTERVAL_S, Pump
 
+_log = logging.getLogger(__name__)
+
 _DEV: Final = Path("/dev")
-_PROC: Final = Path("/proc")
 
 _BAUDRATE_TOLERANCE: Final = 0.03  # an 8N1 receiver bears about 5 % between both ends
 _TCGETS2: Final = 0x802C542A  # asm-generic/ioctls.h: the speed in bit/s, where termios knows named rates only
@@ -79,6 +82,11 @@ class TtyPort:
             raise PortError(f"{description}: the driver cannot do {baudrate} Bd, it chose {actual} Bd")
         with contextlib.suppress(OSError, ValueError):  # most drivers do not know it
             device.set_low_latency_mode(True)
+        directory = sysfs.tty_directory(self.fd)
+        self.serial_number = sysfs.serial_number(directory) if directory else None
+        latency_ms = sysfs.latency_ms(directory) if directory else None
+        if latency_ms is not None and latency_ms > 1:
+            _log.warning("latency port=%s timer_ms=%d: each answer comes late", description, latency_ms)
 
     def close(self) -> None:
         self.fd = -1
@@ -98,6 +106,7 @@ class TcpPort:
 
     def __init__(self, url: str) -> None:
         self.description = url
+        self.serial_number: str | None = None
         self.failure: BridgeError | None = None  # never set: read() tells
         try:
             parts = urlsplit(url)
@@ -128,6 +137,7 @@ class PumpedPort(Pump):
 
     def __init__(self, url: str, device: Any) -> None:
         super().__init__(url, socket.SOCK_STREAM)
+        self.serial_number: str | None = None
         self._device = device
         connection = getattr(device, "_socket", None)  # pyserial has no public way to it
         if isinstance(connection, socket.socket):
@@ -181,10 +191,10 @@ def _explain(port: str, baudrate: int, error: Exception) -> str:
         case errno.EACCES | errno.EPERM:
             return f"{port}: {_explain_permission(Path(port))}"
         case errno.EBUSY | errno.EAGAIN:
-            users = ", ".join(_users(Path(port))) or "another program"
+            users = ", ".join(sysfs.users(Path(port))) or "another program"
             return f"{port}: in use by {users}: stop that first"
         case errno.ENOTTY if _is_tty_name(port):  # another line discipline has it, as of slcand
-            holders = ", ".join(_users(Path(port))) or "another program"
+            holders = ", ".join(sysfs.users(Path(port))) or "another program"
             return f"{port}: in use by {holders}: stop that first"
         case errno.ENOTTY | errno.EISDIR:
             return f"{port}: not a serial port"
@@ -228,17 +238,6 @@ def _explain_permission(path: Path) -> str:
         return f"user {user} has no permission: add it to group {group} (`usermod -aG {group} {user}`)"
     owner = f"{stat.filemode(status.st_mode)}, group {group}"
     return f"user {user} has no permission ({owner}): check udev rules, and DeviceAllow= of the service"
-
-
-def _users(path: Path) -> list[str]:
-    """Which processes have it open, as far as /proc lets us see: `slcand (process 123)`."""
-    device = str(path.resolve())
-    users = []
-    for process in _PROC.glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # not ours, or just ended
-            if any(str(link.readlink()) == device for link in (process / "fd").iterdir()):
-                users.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
-    return users
 
 
 def _explain_network(url: str, cause: BaseException) -> str:

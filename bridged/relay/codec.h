@@ -14,31 +14,48 @@ enum codec_kind {
     CODEC_OK,      /* "\r": a command was done */
     CODEC_SENT,    /* "z\r", "Z\r": a frame was taken for transmission */
     CODEC_REFUSED, /* "\a": a command was refused */
-    CODEC_TEXT,    /* any other line of printable ASCII, without its end: "V1013", "F04", "A" */
+    CODEC_TEXT,    /* any other answer or report, without what frames it: "V1013", "F04"; 06 01 02 */
+    CODEC_STOP,    /* the device's transmit buffer is nearly full: send no more */
+    CODEC_GO,      /* it has room again */
+    CODEC_RETURNED, /* *frame is handed back: the device had no room for it */
+    CODEC_OVERRUN, /* the device lost a frame that it received */
     CODEC_SKIPPED, /* bytes that are no message: noise, a frame that contradicts itself */
 };
 
 struct codec_message {
     enum codec_kind kind;
     uint8_t stamp_digits;  /* CODEC_FRAME: hex digits of time stamp that followed: 0, 4 or 8 */
-    const uint8_t *text;   /* CODEC_TEXT: first byte, inside the caller's input */
+    const uint8_t *text;   /* CODEC_TEXT: first byte, inside the caller's input or the codec_state */
     size_t length;         /* CODEC_TEXT: length in bytes. CODEC_SKIPPED: how many bytes are skipped */
 };
 
+enum { CODEC_KEPT_MAX = 20 }; /* bytes of the longest message of a binary protocol */
+
 /* What a decoder must remember between two calls; zero it to start. */
 struct codec_state {
+    /* can232 */
     bool discarding; /* inside a line that is too long: skip until its end */
     bool dirty;      /* noise was skipped since the last end of line: an empty line means nothing now */
+    /* usb2can */
+    bool doubt;      /* not certain where messages begin: a frame counts once something valid follows it */
+    bool quiet;      /* set by the caller: nothing has come for long, decide with what there is */
+    uint8_t kept_length;
+    uint8_t kept[CODEC_KEPT_MAX];    /* the last message: the next may begin in it, where bytes were lost */
+    uint8_t spliced[CODEC_KEPT_MAX]; /* a message that did */
 };
 
 /*
  * decode: looks at in[0..n), returns how many bytes the first message takes (always <= n), 0 when more
  * bytes are needed to tell. Every call that returns > 0 fills *msg; *frame is written only for
- * CODEC_FRAME (all of it: reserved bytes are zero). However a stream is cut, the same frames come out.
- * More bytes are never needed once n >= line_max, so a caller's buffer of that size cannot get stuck.
+ * CODEC_FRAME and CODEC_RETURNED (all of it: reserved bytes are zero). However a stream is cut, the same
+ * frames come out. More bytes are never needed once n >= line_max, so a caller's buffer of that size
+ * cannot get stuck.
  *
  * encode: writes one frame as the device wants it, returns its length, 0 if the frame cannot be said in
  * this protocol. Never writes more than frame_max bytes.
+ *
+ * level: how many frames wait in the device's transmit buffer, if a CODEC_TEXT tells it, else -1. NULL:
+ * the device answers each frame, by CODEC_OK, CODEC_SENT or CODEC_REFUSED.
  */
 struct codec {
     const char *name;
@@ -47,8 +64,10 @@ struct codec {
     size_t (*decode)(struct codec_state *state, const uint8_t *in, size_t n, struct can_frame *frame,
                      struct codec_message *msg);
     size_t (*encode)(const struct can_frame *frame, uint8_t *out);
+    int (*level)(const uint8_t *text, size_t length);
 };
 
 extern const struct codec codec_can232;
+extern const struct codec codec_usb2can;
 
 #endif

@@ -1,6 +1,5 @@
-/* bridged._relay: the relay and the codecs for Python. The only file that includes Python.h. */
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+/* bridged._relay: the relay for Python. */
+#include "module.h"
 
 #include <errno.h>
 #include <string.h>
@@ -28,6 +27,7 @@ static const struct {
     {"EVENT_TEXT", EVENT_TEXT},
     {"EVENT_TIMEOUT", EVENT_TIMEOUT},
     {"EVENT_UNASKED", EVENT_UNASKED},
+    {"EVENT_NOISE", EVENT_NOISE},
     {"EVENT_FRAME_REFUSED", EVENT_FRAME_REFUSED},
     {"EVENT_UNANSWERED", EVENT_UNANSWERED},
     {"EVENT_SILENT", EVENT_SILENT},
@@ -70,16 +70,6 @@ static PyObject *relay_unlock_wake(struct relay *r)
     Py_RETURN_NONE;
 }
 
-static const struct codec *codec_by_name(const char *name)
-{
-    static const struct codec *const codecs[] = {&codec_can232};
-    for (size_t i = 0; i < sizeof codecs / sizeof codecs[0]; i++)
-        if (strcmp(codecs[i]->name, name) == 0)
-            return codecs[i];
-    PyErr_Format(PyExc_ValueError, "no codec named '%s'", name);
-    return NULL;
-}
-
 static int64_t seconds_to_ns(double seconds)
 {
     return (int64_t)(seconds * (double)NS_PER_S);
@@ -91,14 +81,20 @@ static bool seconds_valid(double seconds)
     return seconds >= 1e-9 && seconds < 1e6;
 }
 
-/* Fills a command; prefix is a text of at most one character. */
-static int command_init(struct command *c, const Py_buffer *data, int accept, const char *prefix)
+/* Fills a command; prefix is how the text that answers begins, empty if none does. */
+static int command_init(struct command *c, const Py_buffer *data, int accept, const Py_buffer *prefix)
 {
     if (data->len < 1 || data->len > COMMAND_SIZE) {
         PyErr_Format(PyExc_ValueError, "a command has 1 to %d bytes, not %zd", COMMAND_SIZE, data->len);
         return -1;
     }
-    *c = (struct command){.accept = (uint8_t)accept, .prefix = (uint8_t)prefix[0], .length = (uint8_t)data->len};
+    if (prefix->len > PREFIX_MAX) {
+        PyErr_Format(PyExc_ValueError, "a prefix has up to %d bytes, not %zd", PREFIX_MAX, prefix->len);
+        return -1;
+    }
+    *c = (struct command){
+        .accept = (uint8_t)accept, .prefix_length = (uint8_t)prefix->len, .length = (uint8_t)data->len};
+    memcpy(c->prefix, prefix->buf, (size_t)prefix->len);
     memcpy(c->data, data->buf, (size_t)data->len);
     return 0;
 }
@@ -120,17 +116,17 @@ static PyObject *Relay_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"codec", "queue", "window", "deadline", "answer_timeout", "sync", "sync_prefix", NULL};
     struct settings set = {0};
-    const char *codec, *prefix;
+    const char *codec;
     double deadline, answer_timeout;
-    Py_buffer sync;
+    Py_buffer sync, prefix;
     RelayObject *self = NULL;
 
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$IIddy*s:Relay", names, &codec, &set.queue, &set.window,
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$IIddy*y*:Relay", names, &codec, &set.queue, &set.window,
                                      &deadline, &answer_timeout, &sync, &prefix))
         return NULL;
     set.codec = codec_by_name(codec);
     if (!set.codec || settings_check(&set, deadline, answer_timeout) < 0
-        || command_init(&set.sync, &sync, 0, prefix) < 0)
+        || command_init(&set.sync, &sync, 0, &prefix) < 0)
         goto done;
     set.deadline_ns = seconds_to_ns(deadline);
     set.answer_timeout_ns = seconds_to_ns(answer_timeout);
@@ -142,6 +138,7 @@ static PyObject *Relay_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
     }
 done:
     PyBuffer_Release(&sync);
+    PyBuffer_Release(&prefix);
     return (PyObject *)self;
 }
 
@@ -239,24 +236,24 @@ static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwarg
     }
     struct relay *r = relay_lock(self);
     r->receiving = receiving;
-    transmit_set_gate(r, (enum gate)gate);
+    queue_set_gate(r, (enum gate)gate);
     return relay_unlock_wake(r);
 }
 
 static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
 {
     struct command c;
-    Py_buffer data;
-    const char *prefix;
+    Py_buffer data, prefix;
     double interval;
-    if (!PyArg_ParseTuple(args, "y*sd:set_polling", &data, &prefix, &interval))
+    if (!PyArg_ParseTuple(args, "y*y*d:set_polling", &data, &prefix, &interval))
         return NULL;
-    int result = command_init(&c, &data, ACCEPT_REFUSED, prefix);
+    int result = command_init(&c, &data, ACCEPT_REFUSED, &prefix);
     if (!result && !seconds_valid(interval)) {
         PyErr_SetString(PyExc_ValueError, "interval is seconds, more than 0");
         result = -1;
     }
     PyBuffer_Release(&data);
+    PyBuffer_Release(&prefix);
     if (result < 0)
         return NULL;
     struct relay *r = relay_lock(self);
@@ -266,23 +263,46 @@ static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
     return relay_unlock_wake(r);
 }
 
+static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"ask", "prefix", "capacity", "critical", "ready", NULL};
+    struct flow flow = {0};
+    Py_buffer ask, prefix;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "y*y*$III:set_flow", names, &ask, &prefix, &flow.capacity,
+                                     &flow.critical, &flow.ready))
+        return NULL;
+    int result = command_init(&flow.ask, &ask, 0, &prefix);
+    if (!result && (flow.capacity < 1 || flow.capacity > UINT8_MAX || flow.critical > flow.capacity
+                    || flow.ready >= flow.critical)) {
+        PyErr_SetString(PyExc_ValueError, "ready < critical <= capacity <= 255 is wanted");
+        result = -1;
+    }
+    PyBuffer_Release(&ask);
+    PyBuffer_Release(&prefix);
+    if (result < 0)
+        return NULL;
+    struct relay *r = relay_lock(self);
+    flow_start(r, &flow);
+    return relay_unlock_wake(r);
+}
+
 static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"token", "data", "accept", "prefix", "timeout", NULL};
     struct command c;
     unsigned int token;
-    Py_buffer data;
+    Py_buffer data, prefix;
     int accept;
-    const char *prefix;
     double timeout;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*isd:command", names, &token, &data, &accept, &prefix, &timeout))
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*iy*d:command", names, &token, &data, &accept, &prefix, &timeout))
         return NULL;
-    int result = command_init(&c, &data, accept, prefix);
+    int result = command_init(&c, &data, accept, &prefix);
     if (!result && !seconds_valid(timeout)) {
         PyErr_SetString(PyExc_ValueError, "timeout is seconds, more than 0");
         result = -1;
     }
     PyBuffer_Release(&data);
+    PyBuffer_Release(&prefix);
     if (result < 0)
         return NULL;
     c.token = token;
@@ -356,10 +376,13 @@ static PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64
         {"bus_read", c->bus_read},
         {"tx_frames", c->confirmed},
         {"tx_retries", c->retries},
+        {"tx_returned", c->returned},
+        {"tx_stops", c->stops},
         {"queued", queued},
         {"decoded", c->decoded},
         {"rx_frames", c->delivered},
         {"rx_pending", pending},
+        {"rx_overruns", c->overruns},
         {"rx_stamped", c->stamped},
         {"skipped_messages", c->skipped_messages},
         {"skipped_bytes", c->skipped_bytes},
@@ -402,6 +425,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"detach_bus", Relay_detach_bus, METH_NOARGS, NULL},
     {"set_gates", (PyCFunction)(void (*)(void))Relay_set_gates, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_polling", Relay_set_polling, METH_VARARGS, NULL},
+    {"set_flow", (PyCFunction)(void (*)(void))Relay_set_flow, METH_VARARGS | METH_KEYWORDS, NULL},
     {"command", (PyCFunction)(void (*)(void))Relay_command, METH_VARARGS | METH_KEYWORDS, NULL},
     {"events", Relay_events, METH_NOARGS, NULL},
     {"counters", Relay_counters, METH_NOARGS, NULL},
@@ -422,83 +446,6 @@ static PyType_Spec RELAY_SPEC = {
     .flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,
     .slots = RELAY_SLOTS,
 };
-
-/* --- the codecs for tests --------------------------------------------------------------------- */
-
-static PyObject *message_object(const struct codec_message *msg, const struct can_frame *frame)
-{
-    static const char *const kinds[] = {"idle", "frame", "ok", "sent", "refused", "text", "skipped"};
-    if (msg->kind == CODEC_FRAME)
-        return Py_BuildValue("(sy#i)", "frame", (const char *)frame, (Py_ssize_t)sizeof *frame, msg->stamp_digits);
-    if (msg->kind == CODEC_TEXT)
-        return Py_BuildValue("(sy#i)", "text", (const char *)msg->text, (Py_ssize_t)msg->length, 0);
-    return Py_BuildValue("(sy#i)", kinds[msg->kind], "", (Py_ssize_t)0, (int)msg->length);
-}
-
-/* decode(codec, pieces): the messages of a stream that arrives in these pieces. */
-static PyObject *module_decode(PyObject *Py_UNUSED(module), PyObject *args)
-{
-    const char *name;
-    PyObject *pieces, *list = NULL;
-    if (!PyArg_ParseTuple(args, "sO!:decode", &name, &PyList_Type, &pieces))
-        return NULL;
-    const struct codec *codec = codec_by_name(name);
-    if (!codec || !(list = PyList_New(0)))
-        return NULL;
-    struct codec_state state = {0};
-    uint8_t buffer[8192];
-    size_t length = 0;
-    for (Py_ssize_t i = 0; i < PyList_Size(pieces); i++) {
-        char *bytes;
-        Py_ssize_t n;
-        if (PyBytes_AsStringAndSize(PyList_GetItem(pieces, i), &bytes, &n) < 0)
-            goto failed;
-        if ((size_t)n > sizeof buffer - length) {
-            PyErr_SetString(PyExc_ValueError, "piece too long");
-            goto failed;
-        }
-        memcpy(buffer + length, bytes, (size_t)n);
-        length += (size_t)n;
-        struct can_frame frame;
-        struct codec_message msg;
-        size_t at = 0, used;
-        while (at < length && (used = codec->decode(&state, buffer + at, length - at, &frame, &msg))) {
-            at += used;
-            PyObject *item = message_object(&msg, &frame);
-            int result = item ? PyList_Append(list, item) : -1;
-            Py_XDECREF(item);
-            if (result < 0)
-                goto failed;
-        }
-        length -= at;
-        memmove(buffer, buffer + at, length);
-    }
-    return list;
-failed:
-    Py_DECREF(list);
-    return NULL;
-}
-
-/* encode(codec, frame): the bytes for one struct can_frame; empty if it cannot be said. */
-static PyObject *module_encode(PyObject *Py_UNUSED(module), PyObject *args)
-{
-    const char *name;
-    Py_buffer data;
-    PyObject *result = NULL;
-    if (!PyArg_ParseTuple(args, "sy*:encode", &name, &data))
-        return NULL;
-    const struct codec *codec = codec_by_name(name);
-    struct can_frame frame;
-    if (codec && data.len == sizeof frame) {
-        uint8_t out[64];
-        memcpy(&frame, data.buf, sizeof frame);
-        result = PyBytes_FromStringAndSize((const char *)out, (Py_ssize_t)codec->encode(&frame, out));
-    } else if (codec) {
-        PyErr_SetString(PyExc_ValueError, "a frame has the 16 bytes of struct can_frame");
-    }
-    PyBuffer_Release(&data);
-    return result;
-}
 
 static PyObject *module_clock(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(ignored))
 {

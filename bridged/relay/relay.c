@@ -12,6 +12,8 @@
 
 #define RX_STALL_NS INT64_C(100000000) /* how long frames wait for a full bus queue */
 #define RX_RETRY_NS INT64_C(1000000)
+#define DOUBT_QUIET_NS INT64_C(50000000)     /* until a frame counts that nothing has followed yet */
+#define PARTIAL_QUIET_NS INT64_C(1000000000) /* until the beginning of a message counts as noise */
 
 /* Counts on while the machine is suspended, so that frames grow old in their sleep too. */
 int64_t relay_clock(void)
@@ -47,7 +49,7 @@ struct relay *relay_new(const struct settings *set)
         return NULL;
     r->set = *set;
     r->port = r->bus = r->wake_fd = r->event_fd = -1;
-    r->rx_stalled_ns = r->rx_retry_ns = NEVER;
+    r->rx_stalled_ns = r->rx_retry_ns = r->quiet_at_ns = NEVER;
     r->queue = calloc(set->queue, sizeof *r->queue);
     r->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     r->event_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
@@ -88,7 +90,7 @@ void relay_wake(struct relay *r)
 
 void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length)
 {
-    bool news = kind == EVENT_UNASKED || kind == EVENT_FRAME_REFUSED || kind == EVENT_UNANSWERED || kind == EVENT_STAMPED
+    bool news = kind == EVENT_UNASKED || kind == EVENT_NOISE || kind == EVENT_FRAME_REFUSED || kind == EVENT_UNANSWERED || kind == EVENT_STAMPED
         || kind == EVENT_BUS_DOWN;
     if (r->event_count >= (news ? EVENTS_NEWS : EVENTS_MAX)) {
         r->count.events_lost++;
@@ -200,13 +202,34 @@ static void port_decode(struct relay *r, int64_t now)
         } else if (msg.kind == CODEC_SKIPPED) {
             r->count.skipped_messages++;
             r->count.skipped_bytes += msg.length;
+            if (!r->receiving)
+                relay_emit(r, EVENT_NOISE, 0, r->in + at, msg.length);
+        } else if (msg.kind == CODEC_OVERRUN) {
+            r->count.overruns++;
         } else if (msg.kind != CODEC_IDLE) {
-            transmit_answer(r, &msg, now);
+            transmit_answer(r, &msg, frame, now);
         }
     }
     r->in_length -= at;
     memmove(r->in, r->in + at, r->in_length);
     rx_flush(r, now);
+}
+
+/* Bytes that wait for more may be a message of which some were lost, and must not become one with
+ * those that come much later. A binary protocol has no other sign of it than the time. */
+static void quiet_start(struct relay *r, int64_t now)
+{
+    r->quiet_at_ns = NEVER;
+    if (r->in_length && flow_used(r))
+        r->quiet_at_ns = now + (r->decoder.doubt ? DOUBT_QUIET_NS : PARTIAL_QUIET_NS);
+}
+
+static void quiet_over(struct relay *r, int64_t now)
+{
+    r->decoder.quiet = true;
+    port_decode(r, now);
+    r->decoder.quiet = false;
+    quiet_start(r, now);
 }
 
 void relay_port_lost(struct relay *r, int error)
@@ -229,6 +252,7 @@ static void port_read(struct relay *r, int64_t now)
     }
     r->in_length += (size_t)n;
     port_decode(r, now);
+    quiet_start(r, now);
 }
 
 /* --- bus -> device --------------------------------------------------------------------------- */
@@ -252,13 +276,13 @@ static void bus_message(struct relay *r, struct mmsghdr *m, const struct bus_mes
 {
     r->count.bus_read++;
     if (m->msg_len == CANFD_MTU)
-        transmit_drop(r, TX_FD_FRAME);
+        queue_drop(r, TX_FD_FRAME);
     else if (m->msg_len != CAN_MTU)
-        transmit_drop(r, TX_MALFORMED);
+        queue_drop(r, TX_MALFORMED);
     else if (b->frame.classic.can_id & CAN_ERR_FLAG)
-        transmit_drop(r, TX_ERROR_FRAME);
+        queue_drop(r, TX_ERROR_FRAME);
     else
-        transmit_enqueue(r, &b->frame.classic, now - message_age(&m->msg_hdr, wall_ns), now);
+        queue_add(r, &b->frame.classic, now - message_age(&m->msg_hdr, wall_ns), now);
 }
 
 /* EINTR, EAGAIN: poll tells when. ENETDOWN: the interface went down; said, the socket stays.
@@ -312,6 +336,7 @@ void relay_detach_port(struct relay *r)
         r->in_length = 0;
     }
     r->decoder = (struct codec_state){0};
+    r->quiet_at_ns = NEVER;
     r->stamp_seen = false;
     transmit_reset(r);
 }
@@ -327,6 +352,7 @@ void relay_attach_bus(struct relay *r, int fd)
 static int64_t next_deadline(const struct relay *r)
 {
     int64_t at = transmit_deadline(r);
+    at = r->quiet_at_ns < at ? r->quiet_at_ns : at;
     return r->rx_retry_ns < at ? r->rx_retry_ns : at;
 }
 
@@ -372,6 +398,8 @@ static int64_t turn(struct relay *r, const struct pollfd *ready, int64_t now)
         handle_ready(r, ready, now);
     if (r->rx_retry_ns <= now)
         rx_flush(r, now);
+    if (r->quiet_at_ns <= now)
+        quiet_over(r, now);
     transmit_pump(r, now);
     return next_deadline(r);
 }

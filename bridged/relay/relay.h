@@ -21,11 +21,12 @@
 enum {
     BUS_BATCH = 64,       /* frames per recvmmsg */
     RX_BATCH = 256,       /* frames per sendmmsg, and how many may wait for a full bus queue */
-    WINDOW_MAX = 32,      /* commands unanswered, as configured */
+    WINDOW_MAX = 32,      /* frames and commands unanswered, as configured */
     INFLIGHT_MAX = 64,    /* ring: WINDOW_MAX and the sync command behind them */
     RETRY_MAX = 64,       /* ring: refused frames wait here; never more than were in flight */
     COMMANDS_MAX = 32,    /* ring: commands from Python that wait for their turn */
     COMMAND_SIZE = 64,    /* bytes of one command */
+    PREFIX_MAX = 4,       /* bytes by which a text is known to be a command's answer */
     EVENTS_MAX = 256,     /* ring: events that Python has not fetched yet */
     EVENTS_NEWS = 128,    /* of these for what nobody waits for; the rest is for answers and losses */
     EVENT_SIZE = 256,     /* bytes of text in one event */
@@ -41,7 +42,7 @@ enum tx_drop {
     TX_MALFORMED,    /* no struct can_frame, or one the protocol cannot say */
     TX_QUEUE_FULL,   /* the transmit queue was full */
     TX_STALE,        /* older than the deadline before its turn came */
-    TX_REFUSED,      /* the adapter refused it until its deadline */
+    TX_REFUSED,      /* the adapter refused it, or handed it back, until its deadline */
     TX_OVERTAKEN,    /* refused, and a later frame was taken: sending it now would swap them */
     TX_UNANSWERED,   /* sent, but no answer came: it may or may not be on the bus, so it is not sent again */
     TX_AWAY,         /* no adapter, or not initialised */
@@ -68,6 +69,7 @@ enum event_kind {
     EVENT_TEXT,      /* a command was answered with a text */
     EVENT_TIMEOUT,   /* a command was not answered in time, or the port went away before */
     EVENT_UNASKED,   /* a text that no command asked for */
+    EVENT_NOISE,     /* bytes that are no message, before frames are received */
     EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many retries so far. Not at each */
     EVENT_UNANSWERED,    /* an answer is missing: the line is being resynchronised */
     EVENT_SILENT,    /* not even the sync command is answered; nothing is sent until a new attach */
@@ -78,7 +80,7 @@ enum event_kind {
     EVENT_KINDS,
 };
 
-/* Answers that settle a command; a text settles it when it begins with the command's prefix. */
+/* Answers that settle a command; a text settles it when it begins with the command's prefix, if it has one. */
 enum { ACCEPT_OK = 1, ACCEPT_REFUSED = 2 };
 
 struct tx_frame {
@@ -90,8 +92,9 @@ struct tx_frame {
 struct command {
     uint32_t token;
     uint8_t accept; /* ACCEPT_… */
-    uint8_t prefix; /* first character of the text that answers; 0: none */
+    uint8_t prefix_length;
     uint8_t length;
+    uint8_t prefix[PREFIX_MAX];
     int64_t timeout_ns;
     uint8_t data[COMMAND_SIZE];
 };
@@ -100,6 +103,7 @@ enum inflight_kind {
     INFLIGHT_FRAME,
     INFLIGHT_COMMAND,
     INFLIGHT_POLL,
+    INFLIGHT_LEVEL, /* flow.ask */
     INFLIGHT_CHECK, /* the sync command after a refusal: was it one? */
     INFLIGHT_SYNC,  /* the same after a missing answer */
 };
@@ -107,7 +111,8 @@ enum inflight_kind {
 struct inflight {
     enum inflight_kind kind;
     uint8_t accept;
-    uint8_t prefix;
+    uint8_t prefix_length;
+    uint8_t prefix[PREFIX_MAX];
     uint32_t token;
     int64_t deadline_ns; /* of the answer */
     uint64_t noise;      /* line_noise() when it was sent */
@@ -125,10 +130,13 @@ struct counters {
     uint64_t bus_read;  /* frames read from the bus */
     uint64_t confirmed; /* frames that the adapter took */
     uint64_t retries;   /* frames sent once more after a refusal */
+    uint64_t returned;  /* frames that the adapter handed back */
+    uint64_t stops;     /* how often the adapter said that its transmit buffer is nearly full */
     uint64_t tx_dropped[TX_DROPS];
     uint64_t decoded;   /* frames decoded from the port */
     uint64_t delivered; /* frames put on the bus */
     uint64_t rx_dropped[RX_DROPS];
+    uint64_t overruns;         /* how often the adapter said that it lost frames */
     uint64_t stamped;          /* frames that carried a time stamp */
     uint64_t skipped_messages; /* pieces of noise between messages */
     uint64_t skipped_bytes;
@@ -147,6 +155,22 @@ struct settings {
     struct command sync;       /* a command with an answer that nothing else gives */
 };
 
+/* Window of a device that does not answer frames (flow.c). */
+struct flow {
+    struct command ask; /* answered once all frames before it are taken or handed back; length 0: nothing goes */
+    uint32_t capacity, critical, ready; /* frames in the device's buffer: fit surely, stop above, go below */
+    struct tx_frame sent[WINDOW_MAX]; /* ring: not known to be taken yet */
+    uint32_t sent_head, sent_count;
+    uint32_t asked;        /* how many of them the question in flight covers */
+    uint32_t room;         /* frames that fit surely */
+    uint32_t limit;        /* of sent_count: halved when frames come back, grows to the window again */
+    uint64_t noise;        /* counters.skipped_bytes when `sent` was empty or a question answered last */
+    bool asking, stopped;
+    bool settling;         /* frames came back: none goes before the fate of the others is known */
+    int64_t stopped_ns;    /* since when */
+    int64_t ask_at_ns, ask_delay_ns; /* while nothing can go */
+};
+
 struct relay {
     pthread_mutex_t lock; /* guards all below */
     struct settings set;
@@ -158,7 +182,7 @@ struct relay {
     enum gate gate;
     bool receiving;
 
-    /* bus -> device (transmit.c) */
+    /* bus -> device (queue.c, transmit.c) */
     struct tx_frame *queue; /* ring of set.queue */
     uint32_t queue_head, queue_count;
     uint64_t next_number;
@@ -177,12 +201,14 @@ struct relay {
     uint64_t check_noise; /* line_noise() at the refusal that is being checked */
     bool doubtful; /* an answer may come late: settled before the first frame goes */
     uint32_t sync_tries;
+    struct flow flow;
     uint8_t out[OUT_BUFFER];
     size_t out_start, out_end;
     int64_t out_until_ns; /* what is in `out` is too old then */
 
     /* device -> bus (relay.c) */
     struct codec_state decoder;
+    int64_t quiet_at_ns; /* what is in `in` has waited long enough then */
     bool stamp_seen;
     uint8_t in[PORT_BUFFER];
     size_t in_length;
@@ -223,16 +249,37 @@ void relay_attach_bus(struct relay *r, int fd);
 void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length);
 void relay_port_lost(struct relay *r, int error);
 
+/* queue.c: all with the lock held */
+void queue_add(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now);
+void queue_drop(struct relay *r, enum tx_drop reason);
+void queue_expire(struct relay *r, int64_t now);
+void queue_set_gate(struct relay *r, enum gate gate);
+bool queue_waiting(const struct relay *r);
+struct tx_frame queue_pop(struct relay *r);
+void queue_retry(struct relay *r, const struct tx_frame *tx);
+void queue_overtake(struct relay *r, const struct tx_frame *taken);
+const struct tx_frame *retry_first(struct relay *r);
+struct tx_frame retry_pop(struct relay *r);
+
 /* transmit.c: all with the lock held */
-void transmit_enqueue(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now);
-void transmit_drop(struct relay *r, enum tx_drop reason);
-void transmit_set_gate(struct relay *r, enum gate gate);
-void transmit_expire(struct relay *r, int64_t now);
 void transmit_reset(struct relay *r);
 bool transmit_command(struct relay *r, const struct command *command);
 void transmit_pump(struct relay *r, int64_t now);
 int64_t transmit_deadline(const struct relay *r);
 uint32_t transmit_queued(const struct relay *r);
-void transmit_answer(struct relay *r, const struct codec_message *msg, int64_t now);
+void transmit_answer(struct relay *r, const struct codec_message *msg, const struct can_frame *frame, int64_t now);
+
+/* flow.c: all with the lock held */
+bool flow_used(const struct relay *r);
+void flow_start(struct relay *r, const struct flow *set);
+void flow_reset(struct relay *r);
+bool flow_ready(const struct relay *r);
+bool flow_ask_due(const struct relay *r, bool more, int64_t now);
+void flow_asked(struct relay *r);
+void flow_sent(struct relay *r, const struct tx_frame *tx);
+void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now);
+void flow_unanswered(struct relay *r);
+void flow_message(struct relay *r, enum codec_kind kind, const struct can_frame *frame, int64_t now);
+int64_t flow_deadline(const struct relay *r);
 
 #endif

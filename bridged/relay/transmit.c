@@ -1,7 +1,8 @@
-/* Bus -> device: the transmit queue, the window of unanswered commands, and what answers do to it.
+/* Bus -> device: the window of unanswered commands, and what answers do to it.
  *
  * The device answers in the order of its commands. So an answer belongs to the oldest command in
- * flight, and a text that answers a later one proves that the answers before it were lost. */
+ * flight, and a text that answers a later one proves that the answers before it were lost.
+ * A device that does not answer frames has another window for them: flow.c. */
 #include "relay.h"
 
 #include <errno.h>
@@ -12,35 +13,9 @@
 #define RETRY_LAST_NS INT64_C(16000000)
 #define RETRIES_TOLD 16 /* about four times a second */
 
-static struct tx_frame *queue_at(struct relay *r, uint32_t i)
-{
-    return &r->queue[(r->queue_head + i) % r->set.queue];
-}
-
-static struct tx_frame *retry_at(struct relay *r, uint32_t i)
-{
-    return &r->retry[(r->retry_head + i) % RETRY_MAX];
-}
-
 static struct inflight *inflight_at(struct relay *r, uint32_t i)
 {
     return &r->inflight[(r->inflight_head + i) % INFLIGHT_MAX];
-}
-
-static struct tx_frame queue_pop(struct relay *r)
-{
-    struct tx_frame tx = *queue_at(r, 0);
-    r->queue_head = (r->queue_head + 1) % r->set.queue;
-    r->queue_count--;
-    return tx;
-}
-
-static struct tx_frame retry_pop(struct relay *r)
-{
-    struct tx_frame tx = *retry_at(r, 0);
-    r->retry_head = (r->retry_head + 1) % RETRY_MAX;
-    r->retry_count--;
-    return tx;
 }
 
 /* Grows with everything from the device that was no message, or one that nobody waits for. */
@@ -49,70 +24,19 @@ static uint64_t line_noise(const struct relay *r)
     return r->count.skipped_bytes + r->count.stray_answers;
 }
 
-void transmit_drop(struct relay *r, enum tx_drop reason)
-{
-    r->count.tx_dropped[reason]++;
-}
-
-/* Both lists are in order of age, so only their heads need a look. */
-void transmit_expire(struct relay *r, int64_t now)
-{
-    while (r->retry_count && now - retry_at(r, 0)->born_ns > r->set.deadline_ns) {
-        retry_pop(r);
-        transmit_drop(r, TX_REFUSED);
-    }
-    while (r->queue_count && now - queue_at(r, 0)->born_ns > r->set.deadline_ns) {
-        queue_pop(r);
-        transmit_drop(r, TX_STALE);
-    }
-}
-
-/* A frame from the bus: into the queue, or dropped for what the gate says. */
-void transmit_enqueue(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now)
-{
-    static const enum tx_drop closed[GATES] = {
-        [GATE_AWAY] = TX_AWAY, [GATE_LISTEN_ONLY] = TX_LISTEN_ONLY, [GATE_STOPPED] = TX_STOPPED};
-
-    if (r->gate != GATE_OPEN) {
-        transmit_drop(r, closed[r->gate]);
-        return;
-    }
-    if (r->queue_count == r->set.queue)
-        transmit_expire(r, now);
-    if (r->queue_count == r->set.queue) {
-        transmit_drop(r, TX_QUEUE_FULL);
-        return;
-    }
-    struct tx_frame *tx = queue_at(r, r->queue_count++);
-    tx->frame = *frame;
-    tx->born_ns = born_ns;
-    tx->number = r->next_number++;
-}
-
-/* Frames that wait survive the adapter's absence until their deadline; nothing else does. */
-void transmit_set_gate(struct relay *r, enum gate gate)
-{
-    r->gate = gate;
-    if (gate != GATE_STOPPED && gate != GATE_LISTEN_ONLY)
-        return;
-    enum tx_drop reason = gate == GATE_STOPPED ? TX_STOPPED : TX_LISTEN_ONLY;
-    for (; r->retry_count; retry_pop(r))
-        transmit_drop(r, reason);
-    for (; r->queue_count; queue_pop(r))
-        transmit_drop(r, reason);
-}
-
 /* The oldest command in flight is over without an answer of its own. */
 static void inflight_give_up(struct relay *r)
 {
     const struct inflight *head = inflight_at(r, 0);
 
     if (head->kind == INFLIGHT_FRAME)
-        transmit_drop(r, TX_UNANSWERED);
+        queue_drop(r, TX_UNANSWERED);
     else if (head->kind == INFLIGHT_COMMAND)
         relay_emit(r, EVENT_TIMEOUT, head->token, NULL, 0);
     else if (head->kind == INFLIGHT_POLL)
         r->polling = false;
+    else if (head->kind == INFLIGHT_LEVEL)
+        flow_unanswered(r);
     else
         r->checking = false;
     r->inflight_head = (r->inflight_head + 1) % INFLIGHT_MAX;
@@ -123,8 +47,8 @@ static void inflight_give_up(struct relay *r)
  * refused while anything is still in flight is not sent again. */
 static void retry_doubt(struct relay *r)
 {
-    for (; r->set.window > 1 && r->inflight_count && r->retry_count; retry_pop(r))
-        transmit_drop(r, TX_UNANSWERED);
+    for (; !flow_used(r) && r->set.window > 1 && r->inflight_count && r->retry_count; retry_pop(r))
+        queue_drop(r, TX_UNANSWERED);
 }
 
 /* The port is gone or new: what was in flight will never be answered. */
@@ -143,11 +67,12 @@ void transmit_reset(struct relay *r)
     r->poll.length = 0;
     r->retry_delay_ns = RETRY_FIRST_NS;
     r->retry_at_ns = 0;
+    flow_reset(r);
 }
 
 uint32_t transmit_queued(const struct relay *r)
 {
-    uint32_t n = r->queue_count + r->retry_count;
+    uint32_t n = r->queue_count + r->retry_count + r->flow.sent_count;
     for (uint32_t i = 0; i < r->inflight_count; i++)
         n += r->inflight[(r->inflight_head + i) % INFLIGHT_MAX].kind == INFLIGHT_FRAME;
     return n;
@@ -167,9 +92,9 @@ static void frame_confirmed(struct relay *r, uint64_t number)
 {
     r->count.confirmed++;
     r->retry_delay_ns = RETRY_FIRST_NS;
-    while (r->retry_count && retry_at(r, 0)->number < number) {
+    while (r->retry_count && retry_first(r)->number < number) {
         retry_pop(r);
-        transmit_drop(r, TX_OVERTAKEN);
+        queue_drop(r, TX_OVERTAKEN);
     }
 }
 
@@ -181,19 +106,16 @@ static void frame_confirmed(struct relay *r, uint64_t number)
 static void frame_refused(struct relay *r, const struct tx_frame *tx, uint64_t noise, int64_t now)
 {
     if (r->resyncing || line_noise(r) != noise) {
-        transmit_drop(r, TX_UNANSWERED);
+        queue_drop(r, TX_UNANSWERED);
         return;
     }
     if (r->gate != GATE_OPEN) {
-        transmit_drop(r, r->gate == GATE_STOPPED ? TX_STOPPED : TX_REFUSED);
+        queue_drop(r, r->gate == GATE_STOPPED ? TX_STOPPED : TX_REFUSED);
         return;
     }
     if (r->retry_delay_ns == RETRY_FIRST_NS || r->count.retries % RETRIES_TOLD == 0)
         relay_emit(r, EVENT_FRAME_REFUSED, (uint32_t)r->count.retries, NULL, 0);
-    uint32_t i = r->retry_count++;
-    for (; i && retry_at(r, i - 1)->number > tx->number; i--)
-        *retry_at(r, i) = *retry_at(r, i - 1);
-    *retry_at(r, i) = *tx;
+    queue_retry(r, tx);
     if (!r->checking)
         r->check_noise = line_noise(r);
     r->checking = true;
@@ -228,10 +150,13 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
     case INFLIGHT_POLL:
         poll_done(r, now);
         break;
+    case INFLIGHT_LEVEL:
+        flow_answered(r, msg, now);
+        break;
     case INFLIGHT_CHECK:
         r->checking = false;
         for (; r->retry_count && line_noise(r) != r->check_noise; retry_pop(r))
-            transmit_drop(r, TX_UNANSWERED);
+            queue_drop(r, TX_UNANSWERED);
         break;
     case INFLIGHT_SYNC:
         r->resyncing = r->checking = false;
@@ -243,14 +168,17 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
 static void answer_text(struct relay *r, const struct codec_message *msg, int64_t now)
 {
     for (uint32_t i = 0; i < r->inflight_count; i++) {
-        if (inflight_at(r, i)->prefix != msg->text[0])
+        const struct inflight *in = inflight_at(r, i);
+        if (!in->prefix_length || msg->length < in->prefix_length
+            || memcmp(in->prefix, msg->text, in->prefix_length) != 0)
             continue;
         while (i--)
             inflight_give_up(r);
         inflight_settle(r, EVENT_TEXT, msg, now);
         return;
     }
-    r->count.stray_answers++;
+    if (!flow_used(r)) /* else it may be a report */
+        r->count.stray_answers++;
     relay_emit(r, EVENT_UNASKED, 0, msg->text, msg->length);
 }
 
@@ -262,11 +190,15 @@ static bool answers_refused(struct relay *r)
     return r->retry_count && (r->checking || r->resyncing) && !expected;
 }
 
-/* CODEC_OK, CODEC_SENT, CODEC_REFUSED or CODEC_TEXT came from the device. */
-void transmit_answer(struct relay *r, const struct codec_message *msg, int64_t now)
+/* Anything but a received frame or noise came from the device; `frame` is that of CODEC_RETURNED. */
+void transmit_answer(struct relay *r, const struct codec_message *msg, const struct can_frame *frame, int64_t now)
 {
     if (msg->kind == CODEC_TEXT) {
         answer_text(r, msg, now);
+        return;
+    }
+    if (msg->kind == CODEC_STOP || msg->kind == CODEC_GO || msg->kind == CODEC_RETURNED) {
+        flow_message(r, msg->kind, frame, now);
         return;
     }
     const struct codec_message none = {.kind = msg->kind};
@@ -303,7 +235,8 @@ static void send_command(struct relay *r, const struct command *c, enum inflight
         r->out_until_ns = now + timeout;
     in->token = c->token;
     in->accept = c->accept;
-    in->prefix = c->prefix;
+    in->prefix_length = c->prefix_length;
+    memcpy(in->prefix, c->prefix, sizeof in->prefix);
     memcpy(r->out + r->out_end, c->data, c->length);
     r->out_end += c->length;
 }
@@ -312,12 +245,16 @@ static void send_frame(struct relay *r, const struct tx_frame *tx, int64_t now)
 {
     size_t n = r->set.codec->encode(&tx->frame, r->out + r->out_end);
     if (!n) {
-        transmit_drop(r, TX_MALFORMED);
+        queue_drop(r, TX_MALFORMED);
         return;
     }
-    struct inflight *in = inflight_push(r, INFLIGHT_FRAME, now + r->set.answer_timeout_ns);
-    in->accept = ACCEPT_OK | ACCEPT_REFUSED;
-    in->tx = *tx;
+    if (flow_used(r)) {
+        flow_sent(r, tx);
+    } else {
+        struct inflight *in = inflight_push(r, INFLIGHT_FRAME, now + r->set.answer_timeout_ns);
+        in->accept = ACCEPT_OK | ACCEPT_REFUSED;
+        in->tx = *tx;
+    }
     if (tx->born_ns + r->set.deadline_ns + 1 < r->out_until_ns)
         r->out_until_ns = tx->born_ns + r->set.deadline_ns + 1;
     r->out_end += n;
@@ -367,8 +304,9 @@ static void check_answers(struct relay *r, int64_t now)
         return;
     }
     while (r->inflight_count && inflight_at(r, 0)->deadline_ns <= now) {
-        bool frame = inflight_at(r, 0)->kind == INFLIGHT_FRAME;
-        bool poll = inflight_at(r, 0)->kind == INFLIGHT_POLL;
+        enum inflight_kind kind = inflight_at(r, 0)->kind;
+        bool frame = kind == INFLIGHT_FRAME || kind == INFLIGHT_LEVEL;
+        bool poll = kind == INFLIGHT_POLL;
         if (!frame) /* a frame keeps its place: its answer may only be late */
             inflight_give_up(r);
         if (frame || r->gate == GATE_OPEN || (poll && r->gate == GATE_LISTEN_ONLY)) {
@@ -384,11 +322,13 @@ static void check_answers(struct relay *r, int64_t now)
 /* Whether a frame may go now. After a refusal one at a time, so that none overtakes another. */
 static bool frame_ready(const struct relay *r, int64_t now)
 {
-    if (r->gate != GATE_OPEN || r->silent)
+    if (!queue_waiting(r))
         return false;
+    if (flow_used(r))
+        return flow_ready(r);
     if (r->retry_count)
         return !r->inflight_count && now >= r->retry_at_ns;
-    return r->queue_count > 0;
+    return true;
 }
 
 static bool send_next(struct relay *r, int64_t now)
@@ -399,6 +339,11 @@ static bool send_next(struct relay *r, int64_t now)
         if (!r->inflight_count)
             send_command(r, &r->set.sync, INFLIGHT_CHECK, now);
         return false;
+    }
+    if (flow_ask_due(r, frame_ready(r, now) && !r->command_count, now)) {
+        flow_asked(r);
+        send_command(r, &r->flow.ask, INFLIGHT_LEVEL, now);
+        return true;
     }
     if (r->command_count) {
         send_command(r, &r->commands[r->command_head], INFLIGHT_COMMAND, now);
@@ -454,7 +399,7 @@ void transmit_pump(struct relay *r, int64_t now)
     if (r->port < 0)
         return;
     if (r->out_start == 0) { /* a message the port took in part is finished first */
-        transmit_expire(r, now);
+        queue_expire(r, now);
         while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now))
             ;
     }
@@ -477,6 +422,10 @@ int64_t transmit_deadline(const struct relay *r)
         return at;
     if (r->poll.length && r->receiving && !r->polling && r->poll_at_ns < at)
         at = r->poll_at_ns;
+    if (flow_used(r)) {
+        int64_t ask_at = flow_deadline(r);
+        return ask_at < at ? ask_at : at;
+    }
     if (r->retry_count && r->gate == GATE_OPEN && !r->inflight_count && r->retry_at_ns < at)
         at = r->retry_at_ns;
     return at;

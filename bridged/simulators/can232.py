@@ -248,6 +248,17 @@ class Can232:
             deadline = min(deadline, max(self._free_at, self._clock))
         return deadline
 
+    def report(self) -> dict[str, object]:
+        """State, settings and counters, for a JSON file."""
+        return {
+            "channel": self.state.value,
+            "bitrate": self.bitrate,
+            "code": self.code.hex().upper(),
+            "mask": self.mask.hex().upper(),
+            "counters": vars(self.counters) | {"commands": dict(self.counters.commands)},
+            "eeprom": dataclasses.asdict(self.eeprom),
+        }
+
     # The main loop and its buffers
 
     def _store(self, first: float, piece: bytes) -> None:

@@ -1,17 +1,21 @@
-"""The two ends of a simulated adapter here: a pseudo terminal for its host, a CAN socket for its bus.
+"""The two ends of a simulated adapter here: a terminal or socket for its host, a CAN socket for its bus.
 
-Neither ever blocks: what an end does not take is kept up to a bound, then lost and counted.
+None ever blocks: what an end does not take is kept up to a bound, then lost and counted.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
+import stat
 import struct
+import termios
 import time
 import tty
 from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridged.errors import BusError, PortError
@@ -19,9 +23,11 @@ from bridged.simulators.sja1000 import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
-    from pathlib import Path
 
-HOST_BUFFER = 16_384  # characters kept for a host that does not read, beyond what the pty holds
+HOST_BUFFER = 16_384  # characters kept for a host that does not read, beyond what the kernel holds
+UNIX = "unix:"  # before the path of a socket
+NOBODY_YET = (FileNotFoundError, ConnectionRefusedError, BlockingIOError)  # who listens has not begun to
+PTY_SLAVES = range(136, 144)  # major numbers
 BUS_BUFFER = 4096  # frames kept for a bus that does not take them
 BUS_BATCH = 64  # frames read in one turn
 RECEIVE_BUFFER = 8 << 20  # bytes
@@ -152,6 +158,69 @@ class BusEnd:
 
 
 class HostEnd:
+    """An open descriptor that leads to the host; -1 while there is no host."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.lost = 0  # characters for a host that did not read
+        self.waiting = bytearray()
+        self._fd = -1
+
+    def fileno(self) -> int:
+        """For select(), if there is a host."""
+        return self._fd
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a host; if not, `reconnect` may find one."""
+        return self._fd >= 0
+
+    def reconnect(self) -> bool:
+        """Look once whether there is a host again."""
+        return self.connected
+
+    def read(self, limit: int) -> bytes:
+        """What the host wrote, at most `limit` bytes."""
+        try:
+            data = os.read(self._fd, limit)
+        except BlockingIOError:
+            return b""
+        except OSError:  # EIO of a terminal, ECONNRESET of a socket
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Give the host characters, after those that are waiting."""
+        waiting = self.waiting
+        waiting += data
+        if waiting and self.connected:
+            try:
+                del waiting[: os.write(self._fd, waiting)]
+            except BlockingIOError:
+                pass
+            except OSError:
+                self._hang_up()
+        kept = HOST_BUFFER if self.connected else 0
+        if len(waiting) > kept:
+            self.lost += len(waiting) - kept
+            del waiting[kept:]
+
+    def close(self) -> None:
+        """Hang up."""
+        if self.connected:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _hang_up(self) -> None:
+        """The host has gone."""
+        self.lost += len(self.waiting)
+        self.waiting.clear()
+        HostEnd.close(self)
+
+
+class PtyEnd(HostEnd):
     """A raw pty, with a symbolic link to it if wanted.
 
     Its slave is held open, so that a host may come and go. PortError if it cannot be made.
@@ -159,19 +228,14 @@ class HostEnd:
 
     def __init__(self) -> None:
         try:
-            self._master, self._slave = os.openpty()
+            master, self._slave = os.openpty()
         except OSError as error:
             raise PortError(f"no pseudo terminal: {error.strerror}") from error
+        super().__init__(os.ttyname(self._slave))
+        self._fd = master
         tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.name = os.ttyname(self._slave)
-        self.lost = 0  # characters for a host that did not read
-        self.waiting = bytearray()
+        os.set_blocking(master, False)
         self._link: Path | None = None
-
-    def fileno(self) -> int:
-        """For select()."""
-        return self._master
 
     def link(self, link: Path) -> None:
         """Point a symbolic link to the terminal, atomically; PortError if something else is in its place."""
@@ -185,23 +249,6 @@ class HostEnd:
             raise PortError(f"{link}: cannot be made: {error.strerror}") from error
         self._link = link
 
-    def read(self, limit: int) -> bytes:
-        """What the host wrote, at most `limit` bytes."""
-        try:
-            return os.read(self._master, limit)
-        except BlockingIOError:
-            return b""
-
-    def write(self, data: bytes) -> None:
-        """Give the host characters, after those that are waiting."""
-        waiting = self.waiting
-        waiting += data
-        with contextlib.suppress(BlockingIOError):
-            del waiting[: os.write(self._master, waiting)]
-        if len(waiting) > HOST_BUFFER:
-            self.lost += len(waiting) - HOST_BUFFER
-            del waiting[HOST_BUFFER:]
-
     def close(self) -> None:
         """Hang up, and remove the link if it is still ours."""
         if self._link:
@@ -209,4 +256,76 @@ class HostEnd:
                 if str(self._link.readlink()) == self.name:
                     self._link.unlink()
         os.close(self._slave)
-        os.close(self._master)
+        super().close()
+
+
+class LineEnd(HostEnd):
+    """A line that somebody else has made: a character device, or `unix:PATH`, a stream socket that listens.
+
+    Not open at first. For one who hangs up and comes again, or who begins to listen later, use `reconnect`.
+    """
+
+    def __init__(self, line: str) -> None:
+        super().__init__(line)
+        self._held = -1
+
+    def open(self) -> None:
+        """The first time; PortError if this cannot be a line, whoever is at its other end."""
+        line = self.name
+        try:
+            self._open()
+        except NOBODY_YET as error:
+            if not line.startswith(UNIX):
+                raise PortError(f"{line}: {error.strerror}") from error
+        except OSError as error:
+            raise PortError(f"{line}: cannot be used as a line: {error.strerror or error}") from error
+
+    def reconnect(self) -> bool:
+        """Look once whether the other end is there again."""
+        if not self.connected:
+            with contextlib.suppress(OSError):
+                self._open()
+        return self.connected
+
+    def close(self) -> None:
+        """Hang up."""
+        super().close()
+        self._let_go()
+
+    def _open(self) -> None:
+        if self.name.startswith(UNIX):
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
+                line.setblocking(False)
+                line.connect(self.name.removeprefix(UNIX))
+                self._fd = line.detach()
+        else:
+            self._fd = _open_terminal(self.name)
+        self._let_go()
+
+    def _hang_up(self) -> None:
+        if os.major(os.fstat(self._fd).st_rdev) in PTY_SLAVES:
+            # Until it is closed, no other terminal gets its name, which we might open in its place.
+            self._held = os.dup(self._fd)
+        super()._hang_up()
+
+    def _let_go(self) -> None:
+        if self._held >= 0:
+            os.close(self._held)
+            self._held = -1
+
+
+def _open_terminal(path: str) -> int:
+    """A character device; if it is a terminal, raw, with the rate that it has. OSError if it is none."""
+    if not stat.S_ISCHR(Path(path).stat().st_mode):
+        raise OSError(errno.ENODEV, f"no character device; for a socket write {UNIX}{path}")
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if os.isatty(fd):
+            tty.setraw(fd, termios.TCSANOW)  # drops nothing that has come, and does not wait
+            attributes = termios.tcgetattr(fd)
+            attributes[2] |= termios.CLOCAL | termios.CREAD
+            termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    except termios.error as error:
+        os.close(fd)
+        raise OSError(*error.args) from error
+    return fd

@@ -1,4 +1,4 @@
-"""A simulated CAN232 in real time: `can-bridge simulate can232`."""
+"""A simulated adapter in real time: a terminal or socket, a bus, faults, made-up traffic, files."""
 
 from __future__ import annotations
 
@@ -13,43 +13,51 @@ import math
 import random
 import re
 import select
-import signal
 import socket
 import sys
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from bridged.errors import PortError
-from bridged.simulators.can232 import Can232, Eeprom
-from bridged.simulators.ends import BusEnd, HeldUp, HostEnd, open_can
+from bridged.simulators.ends import BusEnd, HeldUp, HostEnd, LineEnd, PtyEnd
 from bridged.simulators.sja1000 import Frame
-from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
+    import enum
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from bridged.simulators.can232 import Eeprom
+    from bridged.simulators.uart import Uart
+    from bridged.simulators.usb2can import Usb2can
 
 UART_QUEUE = 4096  # characters a host's UART takes for a paced line before its write waits
 SPIN_S = 0.001  # --precise: no sleeping so close to a deadline,
 ACTIVE_S = 0.005  # nor so soon after something happened
-GARBAGE_S = 0.01  # between two bursts
+BURST_S = 0.01  # between two bursts of a fault that lasts
+VALUE_2_BURST = 20  # messages
+BATCH_S = 0.001  # made-up frames wait so long for each other; a host's USB does no better
+TRAFFIC_BATCH = 32  # at most, a device has buffers for twice as many
+TRAFFIC_LATE_S = 0.05  # a bus does not catch up; it has been silent
+RECONNECT_S = 0.1
 
 FAULTS = ("silence", "garbage", "busoff", "refuse", "drop", "reset", "poweroff", "unplug")
+USB2CAN_FAULTS = (*FAULTS, "lostgo", "value2", "overrun")
 
 
 class Fault(NamedTuple):
-    """One of FAULTS, `start_s` after the start; without a duration once, or for good."""
+    """One of the device's, `start_s` after the start; without a duration once, or for good."""
 
     kind: str
     start_s: float
     duration_s: float = 0.0
 
 
-def parse_fault(text: str) -> Fault:
+def parse_fault(text: str, kinds: Sequence[str] = FAULTS) -> Fault:
     """`KIND@START[+DURATION]` in seconds, as `silence@5+3`; ArgumentTypeError if it is not."""
-    match = re.fullmatch(r"([a-z]+)@(\d+\.?\d*)(?:\+(\d+\.?\d*))?", text)
-    if not match or match[1] not in FAULTS:
-        raise argparse.ArgumentTypeError(f"{text!r} is not KIND@START[+DURATION], KIND {', '.join(FAULTS)}")
+    match = re.fullmatch(r"([a-z]+[0-9]?)@(\d+\.?\d*)(?:\+(\d+\.?\d*))?", text)
+    if not match or match[1] not in kinds:
+        raise argparse.ArgumentTypeError(f"{text!r} is not KIND@START[+DURATION], KIND {', '.join(kinds)}")
     return Fault(match[1], float(match[2]), float(match[3] or 0))
 
 
@@ -63,6 +71,14 @@ def mixed_frames(rng: random.Random) -> Iterator[Frame]:
         yield Frame(rng.getrandbits(29 if extended else 11), extended, remote, dlc, data)
 
 
+def record_line(frame: Frame) -> str:
+    """A frame as cansend takes it: `123#1122`, `12345678#`, `123#R5`, `123#R`."""
+    can_id = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
+    if frame.remote:
+        return f"{can_id}#R{frame.dlc or ''}\n"
+    return f"{can_id}#{frame.data.hex().upper()}\n"
+
+
 def write_json(path: Path, value: object) -> None:
     """Write a file atomically."""
     new = path.with_name(f".{path.name}.new")
@@ -70,23 +86,61 @@ def write_json(path: Path, value: object) -> None:
     new.replace(path)
 
 
-class Simulator:
-    """Runs a device on a pty until `stop()`; `run()` blocks, and may be called in a thread.
+class _Unseen(Protocol):
+    frames_unseen: int
 
-    `port` names the terminal, which is there from the start; the link and the files while `run()` runs.
-    `bus` is any datagram socket that carries `struct can_frame`, left open at the end. `on_frame` is called
-    with what the device puts on the bus. `traffic_fps` frames a second come from a bus that does not exist.
+
+class Device(Protocol):
+    """What a Simulator asks of a device: see `Can232`.
+
+    One with an attribute `uart` is asked for the pace of its line, one with an `eeprom` to have it kept.
+    """
+
+    silent: bool
+    refusals: int
+    drop_answers: int
+
+    @property
+    def state(self) -> enum.Enum: ...
+    @property
+    def counters(self) -> _Unseen: ...
+    def power_on(self, now: float) -> None: ...
+    def power_off(self, now: float) -> None: ...
+    def power_cycle(self, now: float) -> None: ...
+    def set_bus_off(self, now: float, bus_off: bool) -> None: ...
+    def garbage(self, now: float, noise: bytes) -> None: ...
+    def host_writes(self, now: float, data: bytes) -> None: ...
+    def bus_frame(self, now: float, frame: Frame) -> None: ...
+    def advance(self, now: float) -> None: ...
+    def take_output(self, now: float) -> bytes: ...
+    def take_bus_frames(self) -> list[Frame]: ...
+    def next_deadline(self) -> float: ...
+    def report(self) -> dict[str, object]: ...
+
+
+class Simulator:
+    """Runs a device until `stop()`; `run()` blocks, and may be called in a thread.
+
+    The host is at the other end of `line` (see `LineEnd`), or of a new pseudo terminal: `port` names it, and
+    it is there from the start; the link and the files while `run()` runs.
+    `bus` is any datagram socket that carries `struct can_frame`, left open at the end. What the device puts
+    on the bus goes to `on_frame` and, a line each, to `record`, an unbuffered file.
+    `traffic_fps` frames a second come from a bus that does not exist, or `traffic_count` frames in all: then
+    those that the device does not see, because its channel is not open, come again.
     `precise` spins instead of sleeping while the line is in use. PortError if an end cannot be made.
     """
 
     def __init__(
         self,
-        device: Can232,
+        device: Device,
         *,
         link: Path | None = None,
+        line: str | None = None,
         bus: socket.socket | None = None,
         on_frame: Callable[[Frame], None] | None = None,
+        record: BinaryIO | None = None,
         traffic_fps: float = 0.0,
+        traffic_count: int | None = None,
         faults: Sequence[Fault] = (),
         rng: random.Random | None = None,
         precise: bool = False,
@@ -95,11 +149,14 @@ class Simulator:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.device = device
+        self._uart: Uart | None = getattr(device, "uart", None)
+        self._eeprom: Eeprom | None = getattr(device, "eeprom", None)
         self._link = link
+        self._line = line
         self._bus = BusEnd(bus) if bus is not None else None
         self._on_frame = on_frame
+        self._record = record
         self._faults = faults
-        self._rng = rng or random.Random(0)
         self._precise = precise
         self._eeprom_file = eeprom_file
         self._eeprom_writes = -1  # in the file
@@ -114,25 +171,34 @@ class Simulator:
         self._host_lost = 0  # by terminals that are no more
         self._order = itertools.count()
         self._agenda: list[tuple[float, int, Callable[[float], None]]] = []  # a heap
-        self._traffic = mixed_frames(self._rng)
+        rng = rng or random.Random(0)
+        self._noise = random.Random()
+        self._noise.setstate(rng.getstate())  # of its own: noise does not change the traffic
+        self._traffic = mixed_frames(rng)
+        self._traffic_frame = next(self._traffic)
         self._traffic_s = 1 / traffic_fps if traffic_fps else math.inf
+        self._traffic_count = traffic_count
+        self._made_up = 0  # frames
         self._next_traffic = math.inf
+        self._traffic_wake = math.inf  # when to see to the traffic, not before _next_traffic
+        self._reconnecting = False
+        self._host: HostEnd | None = self._new_host()
+        if isinstance(self._host, LineEnd):
+            self._host.open()
+        self.port = self._host.name
         self._wake, self._waker = socket.socketpair()
         self._wake.setblocking(False)
         self._waker.setblocking(False)
-        self._host: HostEnd | None = HostEnd()
-        self.port = self._host.name
 
     def run(self) -> None:
         """Simulate until `stop()`; once only."""
         self._started = now = self._clock()
-        self._next_traffic = now + self._traffic_s
+        self._next_traffic = self._traffic_wake = now + self._traffic_s
         for fault in self._faults:
             self._schedule(now + fault.start_s, functools.partial(self._begin, fault))
         try:
-            if self._host and self._link:
-                self._host.link(self._link)
-            if self.device.uart.baud:
+            self._make_link()
+            if self._uart and self._uart.baud:
                 self._held_up = HeldUp()
             while not self._stopping:
                 self._turn()
@@ -156,19 +222,12 @@ class Simulator:
 
     def state(self) -> dict[str, object]:
         """Everything that is counted, in the form of the state file; times in seconds."""
-        device = self.device
-        uart = device.uart
+        uart = self._uart
         bus = self._bus
-        return {
-            "port": self.port,
-            "elapsed_s": self._clock() - self._started,
-            "channel": device.state.value,
-            "bitrate": device.bitrate,
-            "code": device.code.hex().upper(),
-            "mask": device.mask.hex().upper(),
-            "counters": vars(device.counters) | {"commands": dict(device.counters.commands)},
-            "eeprom": dataclasses.asdict(device.eeprom),
-            "uart": {
+        state: dict[str, object] = {"port": self.port, "elapsed_s": self._clock() - self._started}
+        state |= self.device.report()
+        if uart:
+            state["uart"] = {
                 "rate": uart.baud,
                 "host_chars": uart.host_chars,
                 "host_busy_s": uart.host_busy_s,
@@ -176,10 +235,11 @@ class Simulator:
                 "device_busy_s": uart.device_busy_s,
                 "late_max_s": uart.late_max_s,
                 "stalled_s": uart.stalled_s,
-            },
-            "host_lost": self._host_lost + (self._host.lost if self._host else 0),
-            "bus": {"lost": bus.lost, "errors": bus.errors, "ignored": bus.ignored} if bus else None,
-        }
+            }
+        state["traffic"] = {"count": self._traffic_count, "made_up": self._made_up}
+        state["host_lost"] = self._host_lost + (self._host.lost if self._host else 0)
+        state["bus"] = {"lost": bus.lost, "errors": bus.errors, "ignored": bus.ignored} if bus else None
+        return state
 
     # One turn
 
@@ -189,6 +249,9 @@ class Simulator:
         host = self._host
         bus = self._bus
         now = self._clock()
+        if host and not host.connected and not self._reconnecting:
+            self._reconnecting = True
+            self._reconnect(now)
         timeout = self._timeout(now)
         readable, writable, seen = self._wait(now, timeout)
         if self._wake in readable:
@@ -201,12 +264,15 @@ class Simulator:
         now = self._clock()
         while self._agenda and self._agenda[0][0] <= now:
             heapq.heappop(self._agenda)[2](now)
-        while self._next_traffic <= now:
-            device.bus_frame(self._next_traffic, next(self._traffic))
-            self._next_traffic += self._traffic_s
-        output = device.take_output(now)
-        if output:
-            device.uart.delivered(self._clock())
+        if self._traffic_wake <= now:
+            self._make_traffic(now)
+        if self._held_back():
+            device.advance(now)
+            output = b""
+        else:
+            output = device.take_output(now)
+        if output and self._uart:
+            self._uart.delivered(self._clock())
         if self._host and (output or self._host in writable):
             self._host.write(output)
         frames = device.take_bus_frames()
@@ -218,7 +284,10 @@ class Simulator:
 
     def _timeout(self, now: float) -> float | None:
         """How long to wait in seconds, None for ever."""
-        deadline = min(self.device.next_deadline(), self._next_traffic)
+        deadline = self.device.next_deadline()
+        if self._held_back():  # what is due may be just what nobody takes
+            deadline = max(deadline, now + BATCH_S)
+        deadline = min(deadline, self._traffic_wake)
         if self._agenda:
             deadline = min(deadline, self._agenda[0][0])
         if self._precise:
@@ -227,12 +296,16 @@ class Simulator:
             deadline -= SPIN_S
         return None if deadline == math.inf else max(0, deadline - now)
 
+    def _held_back(self) -> bool:
+        """Whether the device has to wait for its host: USB has flow control, this RS232 line does not."""
+        return not self._uart and self._host is not None and bool(self._host.waiting)
+
     def _wait(self, now: float, timeout: float | None) -> tuple[list[Any], list[Any], float]:
         """Which ends can be read and written, as select() says, and since when, without our own delay."""
         readers: list[socket.socket | HostEnd | BusEnd] = [self._wake]
         writers: list[HostEnd | BusEnd] = []
-        if self._host:
-            if self.device.uart.host_backlog < UART_QUEUE:
+        if self._host and self._host.connected:
+            if not self._uart or self._uart.host_backlog < UART_QUEUE:
                 readers.append(self._host)
             if self._host.waiting:
                 writers.append(self._host)
@@ -253,16 +326,38 @@ class Simulator:
                 seen -= self._held_up_s - before_s
         return readable, writable, seen
 
+    def _make_traffic(self, now: float) -> None:
+        """Some made-up frames that were on the bus up to `now`."""
+        counters = self.device.counters
+        self._next_traffic = max(self._next_traffic, now - TRAFFIC_LATE_S)
+        for _ in range(TRAFFIC_BATCH):
+            unseen = counters.frames_unseen
+            self.device.bus_frame(self._next_traffic, self._traffic_frame)
+            self._next_traffic += self._traffic_s
+            if self._traffic_count is None or counters.frames_unseen == unseen:
+                self._made_up += 1
+                self._traffic_frame = next(self._traffic)
+                if self._made_up == self._traffic_count:
+                    self._next_traffic = math.inf
+            if self._next_traffic > now:
+                break
+        else:  # not at once, lest they overflow the device
+            self._traffic_wake = self._next_traffic
+            return
+        self._traffic_wake = self._next_traffic if self._precise else max(self._next_traffic, now + BATCH_S)
+
     def _to_bus(self, frames: list[Frame]) -> None:
         if self._on_frame:
             for frame in frames:
                 self._on_frame(frame)
+        if self._record and frames:  # in one write: who reads the file sees whole lines
+            self._record.write("".join(map(record_line, frames)).encode())
         if self._bus:
             self._bus.write(frames)
 
     def _save(self) -> None:
-        eeprom = self.device.eeprom
-        if self._eeprom_file and eeprom.writes != self._eeprom_writes:
+        eeprom = self._eeprom
+        if eeprom and self._eeprom_file and eeprom.writes != self._eeprom_writes:
             self._eeprom_writes = eeprom.writes
             write_json(self._eeprom_file, dataclasses.asdict(eeprom))
         if self._state_wanted:
@@ -285,7 +380,7 @@ class Simulator:
             case "silence":
                 device.silent = True
             case "garbage":
-                self._make_noise(now + fault.duration_s, now)
+                self._repeat(self._make_noise, now + fault.duration_s, now)
             case "busoff":
                 device.set_bus_off(now, True)
             case "refuse":
@@ -299,6 +394,8 @@ class Simulator:
             case "unplug":
                 device.power_off(now)
                 self._unplug()
+            case _:
+                self._begin_usb2can(fault, now)
         if fault.duration_s:
             self._schedule(now + fault.duration_s, functools.partial(self._end, fault))
 
@@ -318,17 +415,49 @@ class Simulator:
             case "unplug":
                 device.power_on(now)
                 self._plug_in()
+            case "lostgo":
+                self._usb2can().lose_go = 0
 
-    def _make_noise(self, until: float, now: float) -> None:
-        self.device.garbage(now, self._rng.randbytes(self._rng.randint(1, 16)))
-        if now + GARBAGE_S < until:
-            self._schedule(now + GARBAGE_S, functools.partial(self._make_noise, until))
+    def _usb2can(self) -> Usb2can:
+        """The device, whose fault only it has."""
+        from bridged.simulators.usb2can import Usb2can  # noqa: PLC0415 - only the adapter in use is loaded
+
+        assert isinstance(self.device, Usb2can)
+        return self.device
+
+    def _begin_usb2can(self, fault: Fault, now: float) -> None:
+        device = self._usb2can()
+        until = now + fault.duration_s
+        match fault.kind:
+            case "lostgo":
+                device.lose_go = sys.maxsize if fault.duration_s else 1
+            case "value2":
+                self._repeat(functools.partial(device.value_2_burst, count=VALUE_2_BURST), until, now)
+            case "overrun":
+                self._repeat(device.overrun, until, now)
+
+    def _repeat(self, action: Callable[[float], None], until: float, now: float) -> None:
+        """Once, and again every BURST_S until then."""
+        action(now)
+        if now + BURST_S < until:
+            self._schedule(now + BURST_S, functools.partial(self._repeat, action, until))
+
+    def _make_noise(self, now: float) -> None:
+        self.device.garbage(now, self._noise.randbytes(self._noise.randint(1, 16)))
+
+    # The host
+
+    def _new_host(self) -> HostEnd:
+        return LineEnd(self._line) if self._line else PtyEnd()
+
+    def _make_link(self) -> None:
+        if self._link and isinstance(self._host, PtyEnd):
+            self._host.link(self._link)
 
     def _plug_in(self) -> None:
-        self._host = HostEnd()
+        self._host = self._new_host()
         self.port = self._host.name
-        if self._link:
-            self._host.link(self._link)
+        self._make_link()
 
     def _unplug(self) -> None:
         if self._host:
@@ -336,109 +465,9 @@ class Simulator:
             self._host.close()
             self._host = None
 
-
-def load_eeprom(path: Path | None) -> Eeprom:
-    """What a Simulator kept in a file, a new EEPROM if there is none; PortError if it is something else."""
-    if path is None or not path.exists():
-        return Eeprom()
-    try:
-        return Eeprom(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise PortError(f"{path}: not an EEPROM file of this simulator: {error}") from error
-
-
-def positive(text: str) -> float:
-    """A finite number above 0, for argparse."""
-    value = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
-    return value
-
-
-def _whole(text: str) -> int:
-    return int(positive(str(int(text))))
-
-
-def _matching(pattern: str, meaning: str) -> Callable[[str], str]:
-    def check(text: str) -> str:
-        if not re.fullmatch(pattern, text):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {meaning}")
-        return text
-
-    return check
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `can-bridge simulate can232`."""
-    add = parser.add_argument
-    add(
-        "--link",
-        type=Path,
-        metavar="PATH",
-        help="symbolic link to the terminal, made now, removed at the end",
-    )
-    add("--bus", metavar="IFACE", help="SocketCAN interface on its CAN side, as vcan1")
-    add(
-        "--traffic",
-        type=positive,
-        default=0.0,
-        metavar="FPS",
-        help="mixed frames a second from a made-up bus",
-    )
-    add(
-        "--uart-rate",
-        type=_whole,
-        metavar="BAUD",
-        help="pace the line at this rate; default: as fast as it goes",
-    )
-    add(
-        "--processing",
-        type=positive,
-        default=0.0,
-        metavar="SECONDS",
-        help="time the device takes for a command",
-    )
-    version = _matching(r"V\d{4}", "a version like V1324")
-    add("--version", type=version, default="V1324", dest="device_version", metavar="V", help="answer to V")
-    serial = _matching(r"[0-9A-Z]{4}", "a serial number like A123")
-    add("--serial-number", type=serial, default="A123", metavar="N", help="answer to N, without the N")
-    add("--eeprom", type=Path, metavar="FILE", help="keeps the EEPROM and its write count, as JSON")
-    add("--state", type=Path, metavar="FILE", help="counters as JSON, written at the end and on SIGUSR1")
-    faults = f"KIND@START[+DURATION] in seconds, KIND {', '.join(FAULTS)}; may be repeated"
-    add("--fault", type=parse_fault, action="append", default=[], metavar="SPEC", help=faults)
-    add("--seed", type=int, default=0, metavar="N", help="of traffic and garbage")
-    add("--precise", action="store_true", help="spin while the line is in use: exact, takes a processor")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Simulate until SIGTERM or SIGINT, then return 0; PortError, BusError if an end cannot be had."""
-    device = Can232(
-        time.monotonic(),
-        eeprom=load_eeprom(args.eeprom),
-        uart=Uart(args.uart_rate),
-        version=args.device_version,
-        serial_number=args.serial_number,
-        processing_s=args.processing,
-    )
-    for path in (args.link, args.state, args.eeprom):
-        if path and not path.parent.is_dir():
-            raise PortError(f"{path}: there is no directory {path.parent}")
-    with contextlib.ExitStack() as stack:
-        bus = stack.enter_context(open_can(args.bus)) if args.bus else None
-        simulator = Simulator(
-            device,
-            link=args.link,
-            bus=bus,
-            traffic_fps=args.traffic,
-            faults=args.fault,
-            rng=random.Random(args.seed),
-            precise=args.precise,
-            eeprom_file=args.eeprom,
-            state_file=args.state,
-        )
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: simulator.stop())
-        signal.signal(signal.SIGUSR1, lambda *_: simulator.request_state())
-        print(f"CAN232 {args.serial_number} on {args.link or simulator.port}", flush=True)
-        simulator.run()
-    return 0
+    def _reconnect(self, now: float) -> None:
+        """Nobody is at the other end of the line: look for a host again and again."""
+        if self._host and not self._host.reconnect():
+            self._schedule(now + RECONNECT_S, self._reconnect)
+        else:
+            self._reconnecting = False

@@ -4,6 +4,7 @@
 
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <time.h>
 
 enum { FRAMES = 4096, PASSES = 200, ROUNDS = 7, LINE_ROOM = 40 };
@@ -50,13 +51,22 @@ static void frames_fill(canid_t flags, uint8_t len)
     }
 }
 
-/* The wire filled with one line again and again; returns its bytes. */
-static size_t wire_fill(const char *line)
+/* The wire filled with one message again and again; returns its bytes. */
+static size_t wire_fill(const char *message, size_t length)
 {
-    size_t n = 0;
     for (size_t i = 0; i < FRAMES; i++)
-        for (const char *byte = line; *byte; byte++)
-            wire[n++] = (uint8_t)*byte;
+        memcpy(wire + i * length, message, length);
+    return FRAMES * length;
+}
+
+#define WIRE_FILL(message) wire_fill(message, sizeof(message) - 1)
+
+/* What the host sends to a USB2CAN is WRITE_MESSAGE; what comes back is READ_MESSAGE. */
+static size_t wire_receive(const struct codec *codec, size_t n)
+{
+    if (codec == &codec_usb2can)
+        for (size_t at = 0; at < n; at += 3 + (size_t)wire[at + 2])
+            wire[at + 1]++;
     return n;
 }
 
@@ -92,18 +102,32 @@ static void bench_frames(const struct codec *codec, const char *name, canid_t fl
 {
     frames_fill(flags, len);
     bench_encode(codec, name);
-    bench_decode(codec, name, encode_all(codec), CODEC_FRAME);
+    bench_decode(codec, name, wire_receive(codec, encode_all(codec)), CODEC_FRAME);
+}
+
+static void bench_codec(const struct codec *codec)
+{
+    bench_frames(codec, "standard, 8 bytes", 0, 8);
+    bench_frames(codec, "extended, 8 bytes", CAN_EFF_FLAG, 8);
+    bench_frames(codec, "standard, no data", 0, 0);
+    bench_frames(codec, "standard, remote", CAN_RTR_FLAG, 8);
 }
 
 int main(void)
 {
-    bench_frames(&codec_can232, "standard, 8 bytes", 0, 8);
-    bench_frames(&codec_can232, "extended, 8 bytes", CAN_EFF_FLAG, 8);
-    bench_frames(&codec_can232, "standard, no data", 0, 0);
-    bench_frames(&codec_can232, "standard, remote", CAN_RTR_FLAG, 8);
-    bench_decode(&codec_can232, "standard, 8 bytes, stamp", wire_fill("t12380123456789ABCDEFEA5F\r"), CODEC_FRAME);
-    bench_decode(&codec_can232, "z", wire_fill("z\r"), CODEC_SENT);
-    bench_decode(&codec_can232, "F00", wire_fill("F00\r"), CODEC_TEXT);
-    bench_decode(&codec_can232, "no frame, 22 characters", wire_fill("t12380123456789ABCDEG\r"), CODEC_SKIPPED);
+    bench_codec(&codec_can232);
+    bench_decode(&codec_can232, "standard, 8 bytes, stamp", WIRE_FILL("t12380123456789ABCDEFEA5F\r"), CODEC_FRAME);
+    bench_decode(&codec_can232, "z", WIRE_FILL("z\r"), CODEC_SENT);
+    bench_decode(&codec_can232, "F00", WIRE_FILL("F00\r"), CODEC_TEXT);
+    bench_decode(&codec_can232, "no frame, 22 characters", WIRE_FILL("t12380123456789ABCDEG\r"), CODEC_SKIPPED);
+
+    bench_codec(&codec_usb2can);
+    bench_decode(&codec_usb2can, "standard, 8 bytes, stamp",
+                 WIRE_FILL("\x0F\x3F\x0D\x08\x24\x60" "\1\2\3\4\5\6\7\x0F\x9F\x0F"), CODEC_FRAME);
+    bench_decode(&codec_usb2can, "WRITE_REG", WIRE_FILL("\x0F\x12\x01\x06"), CODEC_TEXT);
+    bench_decode(&codec_usb2can, "a byte lost, look-back", WIRE_FILL("\x0F\x41\x04\x01\x24\x60" "\x0F\x12\x01\x06"),
+                 CODEC_FRAME);
+    bench_decode(&codec_usb2can, "no message, 14 bytes",
+                 WIRE_FILL("\x0F\x41\x0B\x07\x24\x60" "\1\2\3\4\5\6\7\x08"), CODEC_SKIPPED);
     return EXIT_SUCCESS;
 }

@@ -19,10 +19,16 @@ struct entry {
 struct transcript {
     struct entry *entries;
     size_t count, capacity;
-    size_t pending; /* bytes at the end of the stream that still wait for more */
+    size_t pending;    /* bytes at the end of the stream that still wait for more */
+    bool quiet_at_end; /* set by the test: after the stream comes silence, and the codec is told so */
 };
 
 enum { CUT_NOWHERE = 0, CUT_EVERYWHERE = 1 }; /* any other value is a seed for cuts at random */
+
+static inline bool has_frame(enum codec_kind kind)
+{
+    return kind == CODEC_FRAME || kind == CODEC_RETURNED;
+}
 
 static inline uint64_t random_next(uint64_t *state)
 {
@@ -78,9 +84,57 @@ static inline const char *transcript_add(struct transcript *transcript, const st
         entry->text_start = start + (size_t)(msg->text - in);
         entry->text_length = msg->length;
     }
-    if (msg->kind == CODEC_FRAME)
+    if (has_frame(msg->kind))
         entry->frame = *frame;
     return NULL;
+}
+
+/* A text that a codec had to put together in its state must still be what the stream says up to bytes[end]. */
+static inline const char *transcript_add_spliced(struct transcript *transcript, const struct codec_message *msg,
+                                                 const uint8_t *bytes, size_t start, size_t end)
+{
+    const struct codec_message empty = {.kind = CODEC_TEXT, .text = bytes + start};
+    if (msg->length < end - start || msg->length > end)
+        return "a spliced text that begins where there is no lost message";
+    if (memcmp(bytes + end - msg->length, msg->text, msg->length) != 0)
+        return "a spliced text that says something else than the stream";
+    const char *violated = transcript_add(transcript, &empty, NULL, bytes + start, start, end - start);
+    if (!violated) {
+        transcript->entries[transcript->count - 1].text_start = end - msg->length;
+        transcript->entries[transcript->count - 1].text_length = msg->length;
+    }
+    return violated;
+}
+
+/* One call, of what lies in in[0..left), where the stream goes on at bytes[done]. */
+static inline const char *transcript_step(struct transcript *transcript, const struct codec *codec,
+                                          struct codec_state *state, const uint8_t *bytes, size_t done,
+                                          const uint8_t *in, size_t left, size_t *taken)
+{
+    struct codec_state before = *state;
+    struct codec_message msg = {.kind = (enum codec_kind)99, .stamp_digits = 99, .text = in, .length = 99};
+    struct can_frame poison, frame;
+
+    memset(&poison, 0xA5, sizeof poison);
+    frame = poison;
+    *taken = codec->decode(state, in, left, &frame, &msg);
+    if (*taken > left)
+        return "took more bytes than there are";
+    if (*taken == 0 && left >= codec->line_max)
+        return "stuck with line_max bytes";
+    if (*taken == 0 && transcript->quiet_at_end && state->quiet)
+        return "waits though all is quiet";
+    if (*taken == 0 && memcmp(&before, state, sizeof before) != 0)
+        return "changed its state without taking a byte";
+    if (state->quiet != before.quiet)
+        return "changed what is the caller's";
+    if ((*taken == 0 || !has_frame(msg.kind)) && memcmp(&frame, &poison, sizeof frame) != 0)
+        return "wrote a frame without CODEC_FRAME or CODEC_RETURNED";
+    if (*taken == 0)
+        return NULL;
+    if (msg.kind == CODEC_TEXT && msg.text >= state->spliced && msg.text < state->spliced + sizeof state->spliced)
+        return transcript_add_spliced(transcript, &msg, bytes, done, done + *taken);
+    return transcript_add(transcript, &msg, &frame, in, done, *taken);
 }
 
 /*
@@ -91,36 +145,22 @@ static inline const char *transcript_decode(struct transcript *transcript, const
                                             const uint8_t *bytes, size_t n, uint64_t cuts)
 {
     struct codec_state state = {0};
-    struct can_frame poison;
     const char *violated = NULL;
     size_t fed = 0, done = 0;
 
-    memset(&poison, 0xA5, sizeof poison);
     transcript->count = 0;
-    while (fed < n && !violated) {
-        fed += piece_next(&cuts, n - fed);
+    while (!violated && (fed < n || (transcript->quiet_at_end && done < n))) {
+        if (fed == n)
+            state.quiet = true;
+        else
+            fed += piece_next(&cuts, n - fed);
         size_t base = done, size = fed - base, taken = 0;
         uint8_t *in = malloc(size);
         if (!in)
             return "out of memory";
         memcpy(in, bytes + base, size);
         do {
-            const uint8_t *at = in + (done - base);
-            size_t left = fed - done;
-            struct can_frame frame = poison;
-            struct codec_message msg = {.kind = (enum codec_kind)99, .stamp_digits = 99, .text = at, .length = 99};
-            struct codec_state before = state;
-            taken = codec->decode(&state, at, left, &frame, &msg);
-            if (taken > left)
-                violated = "took more bytes than there are";
-            else if (taken == 0 && left >= codec->line_max)
-                violated = "stuck with line_max bytes";
-            else if (taken == 0 && (before.discarding != state.discarding || before.dirty != state.dirty))
-                violated = "changed its state without taking a byte";
-            else if ((taken == 0 || msg.kind != CODEC_FRAME) && memcmp(&frame, &poison, sizeof frame) != 0)
-                violated = "wrote a frame without CODEC_FRAME";
-            else if (taken > 0)
-                violated = transcript_add(transcript, &msg, &frame, at, done, taken);
+            violated = transcript_step(transcript, codec, &state, bytes, done, in + (done - base), fed - done, &taken);
             done += taken;
         } while (taken > 0 && done < fed && !violated);
         free(in);

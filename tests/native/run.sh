@@ -1,7 +1,7 @@
 #!/bin/sh
 # Builds and runs the C unit tests with every compiler there is, under AddressSanitizer and UBSan.
-# run.sh         the tests; also that the codec compiles without a warning at -O2, and that the bench compiles
-# run.sh bench   the codec's throughput instead
+# run.sh         the tests; also that the codecs compile without a warning at -O2, and that the bench compiles
+# run.sh bench   the codecs' throughput instead
 set -eu
 cd "$(dirname "$0")/../.."
 
@@ -32,7 +32,8 @@ run_test() {
 }
 
 bench() {
-    "$cc" -std=c11 -O2 -Wall -Wextra -Werror "$native/bench_codec.c" "$relay/codec_can232.c" -o "$build/bench_codec-$cc"
+    "$cc" -std=c11 -O2 -Wall -Wextra -Werror "$native/bench_codec.c" "$relay"/codec_*.c \
+        -o "$build/bench_codec-$cc"
 }
 
 failed=0
@@ -46,9 +47,11 @@ for cc in gcc clang; do
         "$build/bench_codec-$cc"
         continue
     fi
-    strict codec_can232
-    run_test codec_can232 codec_can232
-    run_test codec_can232_streams codec_can232
+    for codec in codec_can232 codec_usb2can; do
+        strict "$codec"
+        run_test "$codec" "$codec"
+        run_test "${codec}_streams" "$codec"
+    done
 done
 if [ "$compilers" = 0 ]; then
     echo "run.sh: neither gcc nor clang found" >&2

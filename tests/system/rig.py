@@ -9,6 +9,7 @@ import json
 import os
 import random
 import re
+import select
 import shutil
 import signal
 import subprocess
@@ -18,11 +19,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import pytest
 import yaml
 
 # An emulated machine is some twenty times slower than a real one: deadlines are for what will never come.
 DEADLINE_S = 60.0
 SOCKET_BUFFER = 10_000_000
+HOST = Path("/ctl/host")  # shared with the host of the virtual machine, see vm/hostside.py
+MONITOR = Path("/dev/virtio-ports/qmp")
 
 T = TypeVar("T")
 
@@ -210,6 +214,124 @@ class Bridge(Process):
         assert self.stop() == 0, str(self)
 
 
+class HostProcess(Process):
+    """A simulator that ``vm/hostside.py`` runs for us on the host of the virtual machine, at its full speed.
+
+    Its directory is HOST here and the current one there, so relative paths mean the same file to both.
+    """
+
+    def __init__(self, arguments: Sequence[str | Path], name: str) -> None:
+        self.arguments = [str(argument) for argument in arguments]
+        self.log = HOST / name
+        self._out, self._err = self.log.with_suffix(".out"), self.log.with_suffix(".err")
+        draft = self.log.with_suffix(".argv-new")
+        draft.write_text("".join(f"{argument}\n" for argument in self.arguments))
+        draft.rename(self.log.with_suffix(".argv"))
+        wait_until(lambda: self._number("pid") or self.status is not None, "the host to start a program")
+        self.pid = self._number("pid") or -1
+
+    def _number(self, suffix: str) -> int | None:
+        file = self.log.with_suffix(f".{suffix}")
+        return int(file.read_text()) if file.exists() else None
+
+    @property
+    def status(self) -> int | None:
+        """The exit status, None while it runs."""
+        return self._number("status")
+
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+        """Wait for its end; the exit status."""
+        wait_until(lambda: self.status is not None, f"the end of {self}", deadline_s)
+        return self._number("status") or 0
+
+    def user_signal(self, deadline_s: float = DEADLINE_S) -> None:
+        """SIGUSR1; returns when it is sent."""
+        request = self.log.with_suffix(".usr1")
+        request.touch()
+        wait_until(lambda: not request.exists() or self.status is not None, "the host to signal", deadline_s)
+
+    def stop(self, with_signal: int = signal.SIGTERM, deadline_s: float = DEADLINE_S) -> int:
+        """Ask it to end, by SIGTERM only, and wait for that; the exit status."""
+        assert with_signal == signal.SIGTERM
+        self.log.with_suffix(".stop").touch()
+        return self.wait(deadline_s)
+
+    def kill(self) -> None:
+        if self.status is None:
+            self.stop()
+
+
+class Chip:
+    """One of the virtual machine's two FTDI chips (``vm/run.sh``); QEMU's monitor is the hand at its plug."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.serial_number = {"ftdi0": "RIG0001", "ftdi1": "RIG0002"}[name]
+
+    @property
+    def usb(self) -> Path | None:
+        """Its directory in /sys, None while it is unplugged."""
+        for file in Path("/sys/bus/usb/devices").glob("*/serial"):
+            with contextlib.suppress(OSError):  # just unplugged
+                if file.read_text().strip() == self.serial_number:
+                    return file.parent
+        return None
+
+    @property
+    def tty(self) -> Path | None:
+        """Its terminal once udev has seen to it; None while it is unplugged or has another driver."""
+        links = Path("/dev/serial/by-id").glob(f"*{self.serial_number}*")
+        return next((link.resolve() for link in links if link.exists()), None)
+
+    @property
+    def far_end(self) -> Path:
+        """What the chip is wired to, where that is in this machine."""
+        return Path("/dev/virtio-ports") / self.name
+
+    def wait_tty(self) -> Path:
+        tty = wait_until(lambda: self.tty, f"the terminal of {self.name}")
+        assert tty
+        return tty
+
+    def unplug(self) -> None:
+        ask_monitor("device_del", id=self.name)
+        wait_until(lambda: self.usb is None and self.tty is None, f"{self.name} to be gone")
+
+    def plug(self) -> None:
+        """Plug it in again, and wait for its terminal."""
+        ask_monitor(
+            "device_add",
+            driver="usb-serial",
+            id=self.name,
+            chardev=self.name,
+            serial=self.serial_number,
+            **{"always-plugged": True},
+        )
+        self.wait_tty()
+
+
+def ask_monitor(command: str, **arguments: Any) -> Any:
+    """Have QEMU's monitor execute a command of QMP; what it returns."""
+    # It accepts its first command only after qmp_capabilities, and that only once.
+    requests = [{"execute": "qmp_capabilities"}, {"execute": command, "arguments": arguments, "id": command}]
+    monitor = os.open(MONITOR, os.O_RDWR)
+    try:
+        os.write(monitor, "".join(json.dumps(request) + "\r\n" for request in requests).encode())
+        text = b""
+        while True:
+            assert select.select([monitor], [], [], DEADLINE_S)[0], f"the monitor does not answer: {text!r}"
+            text += os.read(monitor, 65536)
+            *lines, text = text.split(b"\n")
+            for line in lines:
+                with contextlib.suppress(json.JSONDecodeError):  # the rest of what the last one did not read
+                    reply = json.loads(line)
+                    if reply.get("id") == command:
+                        assert "error" not in reply, f"{requests[1]}: {reply}"
+                        return reply["return"]
+    finally:
+        os.close(monitor)
+
+
 class Rig:
     """Makes the parts of one test in its own directory, and clears them away afterwards."""
 
@@ -220,6 +342,7 @@ class Rig:
         self._processes: list[Process] = []
         self._interfaces: list[str] = []
         self._descriptors: list[int] = []
+        self._chips: list[Chip] = []
         installed = shutil.which("can-bridge")
         self.command = [installed] if installed else [sys.executable, "-m", "bridged"]
 
@@ -283,6 +406,27 @@ class Rig:
             process.wait_ready(lambda: receivers(interface) > before, "the simulated adapter to listen")
         return process, link
 
+    def host_simulate(self, *options: str, adapter: str = "usb2can") -> HostProcess:
+        """A simulated adapter on the host of the virtual machine, behind the chip ``ftdi0``: its process.
+
+        Its CAN side is made of --traffic and --record; a relative path there is one in HOST here.
+        """
+        number = len(list(HOST.glob("*.argv")))
+        arguments = ["simulate", adapter, "--line", "unix:../ftdi0.sock", *options]
+        process = HostProcess(arguments, f"{number:02}-{adapter}")
+        self._processes.append(process)
+        process.wait_ready(lambda: process.out, "the simulated adapter to be ready")
+        return process
+
+    def chip(self, name: str) -> Chip:
+        """One of the virtual machine's FTDI chips, ``ftdi0`` or ``ftdi1``, plugged in; skips elsewhere."""
+        if not MONITOR.exists():
+            pytest.skip("needs the FTDI chips of our virtual machine: ./dev vm run")
+        chip = Chip(name)
+        self._chips.append(chip)
+        chip.wait_tty()
+        return chip
+
     def bridge(self, configuration: dict[str, Any], name: str = "bridge") -> Bridge:
         """A bridge with this configuration, not waited for."""
         file = self.directory / f"{name}.yaml"
@@ -295,6 +439,9 @@ class Rig:
         """End and remove everything; print the logs, which pytest shows if the test has failed."""
         for process in reversed(self._processes):
             process.kill()
+        for chip in self._chips:
+            if chip.usb is None:
+                chip.plug()
         for descriptor in self._descriptors:
             os.close(descriptor)
         for interface in self._interfaces:

@@ -357,6 +357,7 @@ class PairPort:
 
     description = "pair"
     failure = None
+    serial_number = None
 
     def __init__(self) -> None:
         self._near, self.far = socket.socketpair()

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridged import can
+from bridged.simulators import sja1000
 
 with warnings.catch_warnings(action="ignore"):  # python-can 4.1 on Python 3.11
     import can as python_can
@@ -153,6 +154,38 @@ def test_registers_mean_what_the_data_sheet_says(btr0: int, btr1: int) -> None:
 def test_can232_command(timing: can.BitTiming, command: bytes, description: str) -> None:
     assert timing.can232_command() == command
     assert timing.description == description
+
+
+@pytest.mark.parametrize(
+    ("bitrate", "registers"),
+    [
+        (1_000_000, (0x00, 0x14)),
+        (800_000, (0x00, 0x16)),
+        (500_000, (0x00, 0x1C)),
+        (250_000, (0x01, 0x1C)),
+        (125_000, (0x03, 0x1C)),
+        (100_000, (0x04, 0x1C)),
+        (50_000, (0x09, 0x1C)),
+        (20_000, (0x18, 0x1C)),
+        (10_000, (0x31, 0x1C)),
+    ],
+)
+def test_registers_of_a_standard_bitrate(bitrate: int, registers: tuple[int, int]) -> None:
+    """CiA's table, for an adapter that has no command for a bit rate. Needs no python-can."""
+    assert can.BitTiming(bitrate).register_pair == registers
+    assert can.BitTiming.from_registers(*registers).bitrate == bitrate
+    assert sja1000.bitrate(*registers) == bitrate
+    assert quanta_of(*registers)[2] >= 0.75
+
+
+def test_every_standard_bitrate_has_registers() -> None:
+    assert can._STANDARD_REGISTERS.keys() == can.CAN232_STANDARD_BITRATES.keys()
+
+
+@pytest.mark.parametrize("registers", [(0x03, 0x1C), (0x43, 0x1C), (0, 0x14)])
+def test_given_registers_are_kept(registers: tuple[int, int]) -> None:
+    assert can.BitTiming.from_registers(*registers).register_pair == registers
+    assert can.BitTiming(125_000, registers).register_pair == registers
 
 
 def test_acceptance_filter() -> None:

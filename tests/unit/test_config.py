@@ -16,8 +16,9 @@ import pytest
 
 from bridged import config
 from bridged.can import AcceptanceFilter, BitTiming
-from bridged.config import AdapterConfig, BusConfig, ChannelConfig, TransmitConfig, load
+from bridged.config import BusConfig, Can232Config, ChannelConfig, TransmitConfig, Usb2canConfig, load
 from bridged.errors import ConfigError
+from bridged.yaml_source import key_names
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,6 +74,14 @@ def port(text: str) -> str:
     return four_lines(f"{{type: can232, port: {text}}}")
 
 
+def usb2can(extra: str) -> str:
+    return four_lines(f"{{type: usb2can, port: /dev/x, {extra}}}")
+
+
+def usb2can_port(text: str) -> str:
+    return four_lines(f"{{type: usb2can, port: {text}}}")
+
+
 def channel(keys: str) -> str:
     return four_lines(channel=f"{{{keys}}}")
 
@@ -106,7 +115,7 @@ def test_the_whole_schema(file: Path) -> None:
     assert loaded == config.Config(
         name="test",
         path=file,
-        adapter=AdapterConfig(type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number="A123"),
+        adapter=Can232Config(type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number="A123"),
         channel=ChannelConfig(
             timing=BitTiming(125_000), listen_only=False, acceptance=AcceptanceFilter(0x6000, 0x1FF0, False)
         ),
@@ -120,12 +129,41 @@ def test_the_whole_schema(file: Path) -> None:
 def test_defaults(file: Path) -> None:
     file.write_text(four_lines())
     loaded = load(file)
-    assert loaded.adapter == AdapterConfig(
+    assert loaded.adapter == Can232Config(
         type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number=None
     )
     assert loaded.channel == ChannelConfig(timing=BitTiming(125_000), listen_only=False, acceptance=None)
     assert loaded.bus == BusConfig(interface="socketcan", channel="vcan0", create=False, options={})
     assert loaded.transmit == TransmitConfig(queue=1024, window=1, deadline_s=1.0)
+
+
+def test_usb2can(file: Path) -> None:
+    port = "usb://0403:6001/A6008isP"
+    keys = "serial_number: A6008isP, critical_limit: 18, ready_limit: 17"
+    file.write_text(four_lines(f"{{type: usb2can, port: '{port}', {keys}}}", more="transmit: {window: 1}"))
+    loaded = load(file)
+    assert loaded.adapter == Usb2canConfig(
+        type="usb2can", port=port, serial_number="A6008isP", critical_limit=18, ready_limit=17
+    )
+    assert loaded.transmit == TransmitConfig(queue=1024, window=1, deadline_s=1.0)
+
+
+@pytest.mark.parametrize("more", ["", "transmit: {}", "transmit: {deadline: 1}"])
+def test_defaults_of_usb2can(file: Path, more: str) -> None:
+    """The limits that a public client found to work, and more frames ahead: no answer to wait for."""
+    file.write_text(four_lines("{type: usb2can, port: /dev/ttyUSB0}", more=more))
+    loaded = load(file)
+    assert loaded.adapter == Usb2canConfig(
+        type="usb2can", port="/dev/ttyUSB0", serial_number=None, critical_limit=15, ready_limit=7
+    )
+    assert loaded.transmit == TransmitConfig(queue=1024, window=16, deadline_s=1.0)
+
+
+def test_the_type_tells_the_adapters_apart(file: Path) -> None:
+    file.write_text(four_lines("{port: /dev/x, type: !!str usb2can}"))
+    assert isinstance(load(file).adapter, Usb2canConfig)
+    file.write_text(four_lines("{port: /dev/x, type: 'can232'}"))
+    assert isinstance(load(file).adapter, Can232Config)
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
@@ -134,7 +172,35 @@ def test_examples_load(example: Path) -> None:
 
 
 def test_there_are_examples() -> None:
-    assert len(EXAMPLES) >= 4
+    assert {"can232", "usb2can"} <= {example.stem for example in EXAMPLES}
+
+
+@pytest.mark.parametrize("type_", ["can232", "usb2can"])
+def test_the_examples_show_every_key_and_the_defaults(file: Path, type_: str) -> None:
+    text = (REPOSITORY / "config" / f"{type_}.yaml").read_text()
+    sections = {**config._SECTIONS, "adapter": config._ADAPTERS[type_]}
+    for section, schema in sections.items():
+        for key in key_names(schema):
+            assert re.search(rf"^ +(# )?({key}: |acceptance: .*\b{key}: )", text, re.MULTILINE), (
+                section,
+                key,
+            )
+    shown = load(REPOSITORY / "config" / f"{type_}.yaml")
+    file.write_text(four_lines(f"{{type: {type_}, port: /dev/ttyUSB0}}"))
+    defaults = load(file)
+    assert (shown.adapter, shown.transmit) == (defaults.adapter, defaults.transmit)
+
+
+@needs_calculator
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
+def test_what_an_example_has_in_comments_is_right_too(file: Path, example: Path) -> None:
+    text = example.read_text()
+    for comment in re.findall(r"^  # \w+: .*\n", text, re.MULTILINE):
+        line = comment.replace("# ", "", 1)
+        key = line.split(":")[0].strip()
+        if key not in ("btr0", "btr1"):  # go together, without bitrate
+            others = re.sub(rf"^  {key}: .*\n", "", text, flags=re.MULTILINE)
+            assert problems_of(file, others.replace(comment, line)) == [], line
 
 
 @pytest.mark.parametrize(
@@ -150,6 +216,17 @@ def test_there_are_examples() -> None:
         (adapter("baudrate: !!int 9600"), "adapter.baudrate", 9600),
         (port("'socket://[::1]:4001'"), "adapter.port", "socket://[::1]:4001"),
         (port("'rfc2217://nas.local:1?timeout=3'"), "adapter.port", "rfc2217://nas.local:1?timeout=3"),
+        (usb2can_port("'socket://[::1]:4001'"), "adapter.port", "socket://[::1]:4001"),
+        (usb2can_port("usb://0403:6001"), "adapter.port", "usb://0403:6001"),
+        (usb2can_port("usb://0403:FaFa/A/1:2"), "adapter.port", "usb://0403:FaFa/A/1:2"),
+        (usb2can_port("usb://0403:6001, serial_number: 0123"), "adapter.serial_number", "0123"),
+        (usb2can_port("usb://0403:6001/1E5, serial_number: 1E5"), "adapter.serial_number", "1E5"),
+        (usb2can_port("usb://0403:6001/1E5"), "adapter.serial_number", None),
+        (usb2can("critical_limit: 8"), "adapter.critical_limit", 8),
+        (usb2can("critical_limit: 1, ready_limit: 0"), "adapter.critical_limit", 1),
+        (usb2can("ready_limit: 14"), "adapter.ready_limit", 14),
+        (usb2can("ready_limit: 17, critical_limit: 0x12"), "adapter.critical_limit", 18),
+        (four_lines("{type: usb2can, port: /dev/x}", more="transmit: {window: 32, deadline: 0.001}"), "transmit.window", 32),
         (channel("bitrate: 800000"), "channel.timing", BitTiming(800_000)),
         (channel("btr0: 0x03, btr1: 28"), "channel.timing", BitTiming(125_000, (0x03, 0x1C))),
         (channel("btr0: 0b11, btr1: 0x1c"), "channel.timing", BitTiming(125_000, (0x03, 0x1C))),
@@ -205,6 +282,10 @@ SAMPLE_POINT = "a fraction of the bit time from 0.5 to 0.95 is wanted"
 WORD = "a number from 0x00000000 to 0xFFFFFFFF is wanted"
 NAME = "the name of an interface has"
 DEADLINE = "a number of seconds above 0 and up to 3600 is wanted"
+USB = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, is wanted, not"
+CRITICAL = "a number of frames from 1 to 18 is wanted"
+READY = "a number of frames from 0 to 17 is wanted"
+SERIAL_NUMBER = "the serial number that the device reports is wanted"
 SINGLE = "a single value, or a list of single values, is wanted"
 
 
@@ -242,7 +323,34 @@ SINGLE = "a single value, or a list of single values, is wanted"
         (adapter, "baudrate: !!bool x", f"{BAUDRATE}, not the text 'x'"),
         (adapter, "baudrate: !!binary aGk=", "the YAML tag '!!binary' means nothing here; remove it"),
         (adapter, "baudrate: null", f"is empty; {BAUDRATE}, or remove the key"),
-        (adapter, "serial_number: A 1", "the serial number that the device reports is wanted, not the text 'A 1'"),
+        (adapter, "serial_number: A 1", f"{SERIAL_NUMBER}, not the text 'A 1'"),
+        (port, "usb://0403:6001", "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"),
+        (port, "usb://", "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"),
+        (usb2can_port, "ttyUSB0", "a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not"),
+        (usb2can_port, "usb:0403:6001", "a device path begins with '/', such as /dev/ttyUSB0; 'usb:0403:6001' does not"),
+        (usb2can_port, "rfc2217://host:4001", "rfc2217:// sets the baud rate of a serial line, and a FT245 has none; write socket://"),
+        (usb2can_port, "USB://0403:6001", "the URL of a port begins with socket:// or usb://, not 'USB://'"),
+        (usb2can_port, "socket://host", f"socket://{URL} 'socket://host'"),
+        (usb2can_port, "usb://", f"{USB} 'usb://'"),
+        (usb2can_port, "usb://403:6001", f"{USB} 'usb://403:6001'"),
+        (usb2can_port, "usb://0x0403:0x6001", f"{USB} 'usb://0x0403:0x6001'"),
+        (usb2can_port, "usb://0403:600g", f"{USB} 'usb://0403:600g'"),
+        (usb2can_port, "usb://0403:6001/", f"{USB} 'usb://0403:6001/'"),
+        (usb2can_port, "usb://0403:6001/A B", f"{USB} 'usb://0403:6001/A B'"),
+        (usb2can_port, "usb://0403:6001/ö", f"{USB} 'usb://0403:6001/ö'"),
+        (usb2can_port, "usb://٠٤٠٣:6001", f"{USB} 'usb://٠٤٠٣:6001'"),
+        (usb2can_port, "usb://0403:6001/" + "A" * 33, f"{USB} 'usb://0403:6001/{'A' * 24}…'"),
+        (usb2can, "serial_number: A 1", f"{SERIAL_NUMBER}, not the text 'A 1'"),
+        (usb2can, "critical_limit: 0", f"{CRITICAL}, not 0"),
+        (usb2can, "critical_limit: 19", f"{CRITICAL}, not 19"),
+        (usb2can, "ready_limit: 16, critical_limit: 15.5", f"{CRITICAL}, not 15.5"),
+        (usb2can, "critical_limit: 1, ready_limit: 18", f"{READY}, not 18"),
+        (usb2can, "ready_limit: -1", f"{READY}, not -1"),
+        (usb2can, "ready_limit: off", f"{READY}, not the yes-or-no value 'off'"),
+        (usb2can, "ready_limit: null", f"is empty; {READY}, or remove the key"),
+        (usb2can, "critical_limit: 7", "a limit above ready_limit (7, its default) is wanted, not 7"),
+        (usb2can, "ready_limit: 15", "a limit below critical_limit (15, its default) is wanted, not 15"),
+        (usb2can, "critical_limit: 0x0A, ready_limit: 10", "a limit below critical_limit (10) is wanted, not 10"),
         (channel, "bitrate: 123456", "123456 bit/s cannot be reached with the adapter's 16 MHz clock; nearest is 123077 bit/s; or give btr0 and btr1"),
         (channel, "bitrate: 2000000", f"{BITRATE}, not 2000000"),
         (channel, "bitrate: 5000", f"{BITRATE}, not 5000"),
@@ -271,14 +379,19 @@ SINGLE = "a single value, or a list of single values, is wanted"
 def test_one_wrong_value(file: Path, section: Callable[[str], str], entry: str, problem: str) -> None:
     """The last value of the entry is wrong, and only that."""
     text = section(entry)
-    path = f"adapter.port: {entry}" if section is port else f"{section.__name__}.{entry.rpartition(', ')[2]}"
+    if section in (port, usb2can_port):
+        entry = f"port: {entry}"
+    name = section.__name__ if section in (channel, bus, transmit) else "adapter"
+    path = f"{name}.{entry.rpartition(', ')[2]}"
     key, value = path.split(": ", 1)
     line = next(number for number, line in enumerate(text.splitlines()) if entry in line)
     column = text.splitlines()[line].rindex(value)
     assert problems_of(file, text) == [f"{line + 1}:{column + 1}: {key}: {problem}"]
 
 
-ADAPTER_KEYS = "type, port, baudrate, serial_number"
+ADAPTER_KEYS = "type, port, baudrate, serial_number, critical_limit, ready_limit"
+CAN232_KEYS = "type, port, baudrate, serial_number"
+USB2CAN_KEYS = "type, port, serial_number, critical_limit, ready_limit"
 CHANNEL_KEYS = "bitrate, btr0, btr1, sample_point, listen_only, acceptance"
 BUS_KEYS = "interface, channel, create"
 SECTIONS = "sections adapter, channel and bus are wanted"
@@ -310,21 +423,21 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "4:11: transmit: is empty; a section with queue, window, deadline is wanted, or remove the key",
     ]),
     "empty sections": ("adapter: {}\nchannel: {}\nbus: {}\n", [
-        "1:1: adapter.type: is missing; can232 is wanted",
+        "1:1: adapter.type: is missing; can232 or usb2can is wanted",
         f"1:1: adapter.port: is missing; {PORT}",
         "2:1: channel.bitrate: is missing; a bit rate in bit/s (or btr0 and btr1) is wanted",
         "3:1: bus.channel: is missing; the name of an interface is wanted",
     ]),
     # keys
     "unknown": ("adapter:\n  type: can232\n  port: /dev/x\n  baud: 1\nchannel: {bitrate: 125000}\nbus: {channel: vcan0, loop: true}\ntransmitt: {}\n1: 2\n", [
-        f"4:3: adapter.baud: unknown key, baudrate is probably meant; allowed here: {ADAPTER_KEYS}",
+        f"4:3: adapter.baud: unknown key, baudrate is probably meant; allowed here: {CAN232_KEYS}",
         f"6:23: bus.loop: unknown key; allowed here: {BUS_KEYS}",
         "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit",
         "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit",
     ]),
     "in the wrong section": ("adapter: {type: can232, port: /dev/x, bitrate: 1, channel: a}\nchannel: {bitrate: 125000, mask: 1}\nbus: {channel: vcan0}\nport: /dev/x\n", [
-        f"1:39: adapter.bitrate: unknown key, it belongs to channel; allowed here: {ADAPTER_KEYS}",
-        f"1:51: adapter.channel: unknown key, it belongs to bus; allowed here: {ADAPTER_KEYS}",
+        f"1:39: adapter.bitrate: unknown key, it belongs to channel; allowed here: {CAN232_KEYS}",
+        f"1:51: adapter.channel: unknown key, it belongs to bus; allowed here: {CAN232_KEYS}",
         f"2:28: channel.mask: unknown key, it belongs to channel.acceptance; allowed here: {CHANNEL_KEYS}",
         "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit",
     ]),
@@ -350,9 +463,55 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         f"3:19: bus.'\\n': unknown key; allowed here: {BUS_KEYS}",
         "3:28: bus.'\\n': given twice, first in line 3; remove one",
     ]),
+    "in the wrong section, of usb2can": ("adapter: {type: usb2can, port: /dev/x, btr0: 1, ready: 2}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\nready_limit: 3\n", [
+        f"1:40: adapter.btr0: unknown key, it belongs to channel; allowed here: {USB2CAN_KEYS}",
+        f"1:49: adapter.ready: unknown key, ready_limit is probably meant; allowed here: {USB2CAN_KEYS}",
+        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit",
+    ]),
+    "of the other adapter": (adapter("ready_limit: 99, critical_limit: 15, critical_limit: ~"), [
+        "1:39: adapter.ready_limit: goes with type: usb2can; remove it",
+        "1:56: adapter.critical_limit: goes with type: usb2can; remove it",
+        "1:76: adapter.critical_limit: given twice, first in line 1; remove one",
+    ]),
+    "baudrate of usb2can": (usb2can("baudrate: fast"), ["1:40: adapter.baudrate: a FT245 has no baud rate: remove it"]),
+    "type": (four_lines("{type: slcan, port: 'usb://1', baudrate: 49, ready_limit: 18, x: 1}"), [
+        "1:17: adapter.type: can232 or usb2can is wanted, not the text 'slcan'",
+        f"1:30: adapter.port: {USB} 'usb://1'",
+        f"1:51: adapter.baudrate: {BAUDRATE}, not 49",
+        f"1:68: adapter.ready_limit: {READY}, not 18",
+        f"1:72: adapter.x: unknown key; allowed here: {ADAPTER_KEYS}",
+    ]),
+    "type, no text": (four_lines("{type: [usb2can], port: tcp://h}"), [
+        "1:17: adapter.type: can232 or usb2can is wanted, not a list",
+        "1:34: adapter.port: the URL of a port begins with socket:// or rfc2217:// or usb://, not 'tcp://'",
+    ]),
+    "type with a tag": (four_lines("{type: !x usb2can, port: /dev/x, baudrate: 1}"), [
+        "1:17: adapter.type: the YAML tag '!x' means nothing here; remove it",
+        "1:43: adapter.baudrate: a FT245 has no baud rate: remove it",
+    ]),
+    "no type": (four_lines("{port: 'rfc2217://h:0'}"), [
+        "1:1: adapter.type: is missing; can232 or usb2can is wanted",
+        f"1:17: adapter.port: rfc2217://{URL} 'rfc2217://h:0'",
+    ]),
+    "usb2can without a port": (four_lines("{type: usb2can, ready_limit: 2, critical_limit: 2, serial_number: A}"), [
+        f"1:1: adapter.port: is missing; {PORT}",
+        "1:39: adapter.ready_limit: a limit below critical_limit (2) is wanted, not 2",
+    ]),
+    "another serial number": (usb2can_port("'usb://0403:6001/A1', serial_number: a1"), [
+        "1:69: adapter.serial_number: 'a1' is not the one in port, 'A1'; remove one of them",
+    ]),
+    "a wrong port, and a serial number": (usb2can_port("'usb://0403/A1', serial_number: A2"), [
+        f"1:32: adapter.port: {USB} 'usb://0403/A1'",
+    ]),
+    "serial number of a far device": (usb2can_port("socket://h:1, serial_number: A1"), [
+        "1:46: adapter.serial_number: is the USB device's, unknown through socket://; remove it",
+    ]),
+    "usb2can, transmit": (four_lines("{type: usb2can, port: /dev/x}", more="transmit: {window: 0}"), [
+        "4:20: transmit.window: a number of unanswered frames from 1 to 32 is wanted, not 0",
+    ]),
     # combinations
     "several in a section": (four_lines("{type: can231, port: ttyUSB0, baudrate: 1.5}"), [
-        "1:17: adapter.type: can232 is wanted, not the text 'can231'",
+        "1:17: adapter.type: can232 or usb2can is wanted, not the text 'can231'",
         "1:31: adapter.port: a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not",
         f"1:50: adapter.baudrate: {BAUDRATE}, not 1.5",
     ]),
@@ -479,10 +638,11 @@ def test_every_value_has_a_description() -> None:
             assert described or config._AcceptanceKeys in parts, f"{schema.__name__}.{field.name}"
 
 
-def test_a_right_file_is_cheap() -> None:
+@pytest.mark.parametrize("name", ["can232.yaml", "usb2can.yaml"])
+def test_a_right_file_is_cheap(name: str) -> None:
     code = (
         "import sys; from bridged.config import load; load(sys.argv[1]);"
         "print(*{'can', 'difflib', 'serial', 'logging', 'asyncio'} & set(sys.modules))"
     )
-    command = [sys.executable, "-c", code, str(REPOSITORY / "config" / "can232.yaml")]
+    command = [sys.executable, "-c", code, str(REPOSITORY / "config" / name)]
     assert subprocess.run(command, capture_output=True, text=True, check=True, cwd=REPOSITORY).stdout == "\n"

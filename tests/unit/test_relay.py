@@ -40,7 +40,7 @@ class Rig:
             deadline=deadline,
             answer_timeout=0.3,
             sync=b"V\r",
-            sync_prefix="V",
+            sync_prefix=b"V",
         )
         self.port, far_port = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self.bus, far_bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -279,7 +279,7 @@ def test_command_goes_between_frames_and_is_answered_in_order(rig: Rig) -> None:
     rig.bus.send(can_frame(1))
     rig.turn()
     rig.bus.send(can_frame(3))
-    rig.relay.command(7, b"F\r", _relay.ACCEPT_REFUSED, "F", 0.5)
+    rig.relay.command(7, b"F\r", _relay.ACCEPT_REFUSED, b"F", 0.5)
     rig.turn()
     assert len(rig.said()) == 1
     rig.port.send(b"z\r")
@@ -296,7 +296,7 @@ def test_text_answer_proves_that_earlier_answers_are_lost() -> None:
     with rig_with(window=2) as rig:
         rig.bus.send(can_frame(1))
         rig.turn()
-        rig.relay.command(7, b"F\r", _relay.ACCEPT_REFUSED, "F", 0.5)
+        rig.relay.command(7, b"F\r", _relay.ACCEPT_REFUSED, b"F", 0.5)
         rig.turn()
         rig.port.send(b"F00\r")
         rig.turn()
@@ -307,7 +307,7 @@ def test_text_answer_proves_that_earlier_answers_are_lost() -> None:
 def test_port_loss_ends_what_was_in_flight_and_keeps_the_queue(rig: Rig) -> None:
     for n in range(2):
         rig.bus.send(can_frame(n))
-    rig.relay.command(9, b"F\r", _relay.ACCEPT_REFUSED, "F", 0.5)
+    rig.relay.command(9, b"F\r", _relay.ACCEPT_REFUSED, b"F", 0.5)
     rig.port.send(b"t12")
     rig.turn()
     rig.port.shutdown(socket.SHUT_WR)
@@ -372,7 +372,7 @@ def test_frames_before_the_gate_opens_are_not_relayed(rig: Rig) -> None:
 
 
 def test_polling_asks_again_at_once_while_there_are_frames(rig: Rig) -> None:
-    rig.relay.set_polling(b"A\r", "A", 0.01)
+    rig.relay.set_polling(b"A\r", b"A", 0.01)
     rig.turn()
     assert rig.said() == [b"A"]
     rig.port.send(b"t1000\rt1010\rA\r")

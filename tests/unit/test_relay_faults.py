@@ -55,8 +55,8 @@ def test_a_frame_that_waits_in_a_stuck_port_does_not_go_out_late(rig: Rig, stuck
 def test_a_stuck_port_neither_spins_nor_keeps_a_command_for_ever(rig: Rig, stuck: int) -> None:
     assert stuck
     rig.relay.set_gates(receiving=True, transmit=_relay.GATE_LISTEN_ONLY)
-    rig.relay.set_polling(b"A\r", "A", 0.01)
-    rig.relay.command(5, b"C\r", _relay.ACCEPT_OK, "", 0.3)
+    rig.relay.set_polling(b"A\r", b"A", 0.01)
+    rig.relay.command(5, b"C\r", _relay.ACCEPT_OK, b"", 0.3)
     due = rig.turn()
     for _ in range(100):
         if due is None:
@@ -69,7 +69,7 @@ def test_a_stuck_port_neither_spins_nor_keeps_a_command_for_ever(rig: Rig, stuck
 
 
 def test_polling_a_busy_bus_leaves_room_for_frames(rig: Rig) -> None:
-    rig.relay.set_polling(b"A\r", "A", 0.01)
+    rig.relay.set_polling(b"A\r", b"A", 0.01)
     for n in range(20):
         rig.bus.send(can_frame(n))
         for _ in range(4):
@@ -81,7 +81,7 @@ def test_polling_a_busy_bus_leaves_room_for_frames(rig: Rig) -> None:
 
 def test_a_late_answer_of_the_initialisation_refuses_no_frame(rig: Rig) -> None:
     rig.relay.set_gates(receiving=False, transmit=_relay.GATE_AWAY)
-    rig.relay.command(1, b"A\r", _relay.ACCEPT_REFUSED, "A", 0.3)
+    rig.relay.command(1, b"A\r", _relay.ACCEPT_REFUSED, b"A", 0.3)
     rig.turn()
     rig.turn(300)
     rig.relay.set_gates(receiving=True, transmit=_relay.GATE_OPEN)
@@ -98,7 +98,7 @@ def test_a_late_answer_of_the_initialisation_refuses_no_frame(rig: Rig) -> None:
 
 
 def test_a_flood_of_text_crowds_out_neither_answers_nor_the_end(rig: Rig) -> None:
-    rig.relay.command(1, b"F\r", _relay.ACCEPT_REFUSED, "F", 0.3)
+    rig.relay.command(1, b"F\r", _relay.ACCEPT_REFUSED, b"F", 0.3)
     rig.turn()
     rig.port.send(b"x\r" * 600 + b"F00\r")
     rig.port.shutdown(socket.SHUT_WR)
@@ -112,7 +112,7 @@ def test_a_flood_of_text_crowds_out_neither_answers_nor_the_end(rig: Rig) -> Non
 
 def test_listening_by_polls_notices_a_dead_adapter(rig: Rig) -> None:
     rig.relay.set_gates(receiving=True, transmit=_relay.GATE_LISTEN_ONLY)
-    rig.relay.set_polling(b"A\r", "A", 0.01)
+    rig.relay.set_polling(b"A\r", b"A", 0.01)
     for _ in range(10):
         rig.turn(300)
     assert _relay.EVENT_SILENT in kinds(rig)
@@ -121,9 +121,9 @@ def test_listening_by_polls_notices_a_dead_adapter(rig: Rig) -> None:
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf"), 9.3e9])
 def test_times_that_are_none_are_refused(rig: Rig, seconds: float) -> None:
     with pytest.raises(ValueError, match="seconds"):
-        rig.relay.command(1, b"F\r", 0, "F", seconds)
+        rig.relay.command(1, b"F\r", 0, b"F", seconds)
     with pytest.raises(ValueError, match="seconds"):
-        rig.relay.set_polling(b"A\r", "A", seconds)
+        rig.relay.set_polling(b"A\r", b"A", seconds)
 
 
 @pytest.mark.parametrize(

@@ -5,72 +5,24 @@ import contextlib
 import json
 import os
 import random
-import select
 import signal
 import socket
-import subprocess
-import sys
-import threading
 import time
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from simulating import TIMEOUT_S, ask, by_hand, host, process, read, running, until
 
-import bridged
 from bridged.errors import BusError, PortError
 from bridged.simulators.can232 import Can232, Eeprom
-from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, HostEnd, open_can, pack, unpack
-from bridged.simulators.serve import Fault, Simulator, load_eeprom, mixed_frames, parse_fault
+from bridged.simulators.commands import load_eeprom
+from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
+from bridged.simulators.serve import Fault, Simulator, mixed_frames, parse_fault
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.uart import Uart
 
 FRAME = Frame(0x100, False, False, 2, b"\x11\x33")
-TIMEOUT_S = 20
-
-
-@contextlib.contextmanager
-def running(simulator: Simulator) -> Iterator[Simulator]:
-    thread = threading.Thread(target=simulator.run)
-    thread.start()
-    try:
-        yield simulator
-    finally:
-        simulator.stop()
-        thread.join(TIMEOUT_S)
-        assert not thread.is_alive()
-
-
-@contextlib.contextmanager
-def host(port: str | Path) -> Iterator[int]:
-    fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
-    try:
-        tty.setraw(fd)
-        yield fd
-    finally:
-        os.close(fd)
-
-
-def read(fd: int, length: int) -> bytes:
-    """So many bytes, or what there was when time was up."""
-    data = b""
-    deadline = time.monotonic() + TIMEOUT_S
-    while len(data) < length and select.select([fd], [], [], max(0, deadline - time.monotonic()))[0]:
-        data += os.read(fd, length - len(data))
-    return data
-
-
-def ask(fd: int, commands: bytes, answer: bytes) -> None:
-    os.write(fd, commands)
-    assert read(fd, len(answer)) == answer
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        select.select([], [], [], 0.002)
 
 
 @pytest.fixture
@@ -137,7 +89,7 @@ def test_a_host_that_does_not_read_loses_its_own_and_blocks_nothing():
 
 
 def test_what_a_host_does_not_read_is_kept_up_to_a_bound():
-    end = HostEnd()
+    end = PtyEnd()
     with host(end.name) as fd:
         for _ in range(1000):
             end.write(b"t1000\r" * 100)
@@ -164,33 +116,6 @@ def test_made_up_traffic_comes_at_its_rate_and_frames_sent_are_shown():
         until(lambda: sent)
     assert sent == [FRAME]
     assert {chr(line[0]) for line in lines.split(b"\r") if line} == set("tTrR")
-
-
-class HandClock:
-    """A clock that a test sets; it wakes the simulator to see it."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-        self.simulator: Simulator | None = None
-
-    def __call__(self) -> float:
-        return self.now
-
-    def set(self, now: float) -> None:
-        assert self.simulator
-        self.now = now
-        self.simulator.request_state()
-
-
-def by_hand(device: Can232 | None = None, *faults: str, **options: object) -> tuple[Simulator, HandClock]:
-    clock = HandClock()
-    clock.simulator = Simulator(
-        device or Can232(),
-        faults=[parse_fault(text) for text in faults],
-        clock=clock,
-        **options,  # type: ignore[arg-type]
-    )
-    return clock.simulator, clock
 
 
 def test_unplugging_hangs_up_and_plugging_in_makes_a_new_port(tmp_path: Path):
@@ -349,34 +274,12 @@ def test_a_broken_eeprom_file_is_an_error(tmp_path: Path):
             load_eeprom(file)
 
 
-MAIN = """
-import argparse
-from bridged.simulators import serve
-parser = argparse.ArgumentParser()
-serve.add_arguments(parser)
-raise SystemExit(serve.run(parser.parse_args()))
-"""
-
-
-@contextlib.contextmanager
-def process(tmp_path: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-c", MAIN, "--link", f"{tmp_path}/tty", "--eeprom", f"{tmp_path}/eeprom"]
-    root = Path(bridged.__file__).parents[1]
-    with subprocess.Popen([*command, "--state", f"{tmp_path}/state", *options], cwd=root) as child:
-        try:
-            until(lambda: (tmp_path / "tty").is_symlink() or child.poll() is not None)
-            yield child
-        finally:
-            child.kill()
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_the_command_keeps_its_eeprom_and_ends_with_0(tmp_path: Path, number: signal.Signals):
     link, state = tmp_path / "tty", tmp_path / "state"
+    options = ("--eeprom", f"{tmp_path}/eeprom", "--version", "V1335", "--serial-number", "B00F")
     for start in (1, 2):
-        with process(
-            tmp_path, "--version", "V1335", "--serial-number", "B00F", "--fault", "silence@900+1"
-        ) as child:
+        with process(tmp_path, "can232", *options, "--fault", "silence@900+1") as child:
             with host(link) as fd:
                 ask(fd, b"V\rN\rX1\rS4\rO\rt1000\r", b"V1335\rNB00F\r\r\r\rz\r")
             assert not state.exists()
@@ -386,6 +289,7 @@ def test_the_command_keeps_its_eeprom_and_ends_with_0(tmp_path: Path, number: si
             assert seen["eeprom"]["writes"] == start
             assert seen["counters"]["commands"]["t"] == 1
             assert seen["channel"] == "open"
+            assert seen["uart"]["rate"] is None
             child.send_signal(number)
             assert child.wait(TIMEOUT_S) == 0
         assert not link.is_symlink()

@@ -1,0 +1,314 @@
+"""CANLAB USB2CAN: a PIC and an SJA1000 behind an FTDI FT245 ("Popis USB komunikace", chapters II and III)."""
+
+from __future__ import annotations
+
+import logging
+import re
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from bridged.adapters.base import Answer, Exchange, Flow, Identity, Memory, Polling, Reply, Steps
+from bridged.errors import AdapterError, WrongDeviceError
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+    from bridged.config import ChannelConfig, Usb2canConfig
+
+log = logging.getLogger(__name__)
+
+TEXT, NONE = Reply.TEXT, Reply.NONE
+
+START = 0x0F
+CONFIG_MODE, NORMAL_MODE, GET_MODE = 2, 3, 6
+BUS_OFF, ERROR, ERROR_STATUS = 8, 9, 1
+READ_REG, WRITE_REG, COMMAND, FW_VERSION = 16, 18, 32, 33
+CRITICAL_LIMIT, READY_LIMIT, ENABLE_READ_TEC, ENABLE_READ_REC, GET = 0, 1, 2, 3, 128
+BOOT, CONFIG, NORMAL = 0, 1, 2  # what GET_MODE tells
+MODE_NAMES = ("BOOT", "CONFIG", "NORMAL", "LOOPBACK")
+
+MOD, SR, IER, BTR0, BTR1, OCR, ACR0, AMR0, CDR = 0, 2, 4, 6, 7, 8, 16, 20, 31  # SJA1000, PeliCAN
+RESET_MODE, LISTEN_ONLY, SINGLE_FILTER = 0x01, 0x02, 0x08  # bits of MOD
+BUS_STATUS, ERROR_STATUS_BIT = 0x80, 0x40  # bits of SR
+
+CAPACITY = 18
+"""Frames that the transmit buffer surely holds: the highest critical limit there is (COMMAND, 0)."""
+
+ANSWER_TIMEOUT_S: Final = 0.3
+MODE_TRIES = 5  # a half message of another program swallows up to 16 bytes, one try has 6
+LEVEL_LOOKS = 20  # at the transmit buffer, until the channel is closed all the same
+NOISE_KEPT = 256  # bytes
+FMS_SERIES, LOAD_SERIES = "7", "2"  # of the firmware: the y of HWxxxxFWyzzz
+
+TRIPLE = re.compile(rb"\x0f[^\xef]{1,64}\xef", re.DOTALL)
+"""A message of CANLAB's Triple: the same start byte, but an end byte."""
+
+
+class Levels(NamedTuple):
+    """What COMMAND GET tells."""
+
+    critical: int
+    ready: int
+    waiting: int  # frames in both transmit buffers
+
+
+def message(command: int, *data: int) -> bytes:
+    """One message to the device: `0F 12 02 00 01` writes 0x01 to register 0."""
+    return bytes((START, command, len(data), *data))
+
+
+def _exchange(request: bytes, purpose: str, prefix: bytes, *, optional: bool = False) -> Exchange:
+    """A request and the beginning of its answer; an `optional` one may be missing."""
+    accept, reject = ((TEXT, NONE), ()) if optional else ((TEXT,), (NONE,))
+    return Exchange(request, purpose, accept, reject, prefix, timeout_s=ANSWER_TIMEOUT_S)
+
+
+class Usb2can:
+    """Sans-I/O: what to say to a USB2CAN. `identity` and `flow` hold what init_steps found out."""
+
+    codec = "usb2can"
+    baudrate = 115_200  # of no meaning to a FT245, but a tty wants one
+    answer_timeout_s = ANSWER_TIMEOUT_S
+    polling: Polling | None = None
+    last_words = message(CONFIG_MODE) + message(WRITE_REG, MOD, RESET_MODE)
+
+    def __init__(self, adapter: Usb2canConfig, channel: ChannelConfig, _memory: Memory) -> None:
+        self._port = adapter.port
+        self._wanted_serial = adapter.serial_number
+        self._critical = adapter.critical_limit
+        self._ready = adapter.ready_limit
+        self._channel = channel
+        self._noise = bytearray()
+        self._levels_prefix: bytes | None = None  # how this firmware begins its answer to COMMAND GET
+        self.identity = Identity()
+        self.flow: Flow | None = None
+        # Mode NORMAL is part of the answer: after a reset the device would answer, but take no frames.
+        self.sync = _exchange(message(GET_MODE), "tell its mode", bytes((GET_MODE, 1, NORMAL)))
+
+    # --- start and end ------------------------------------------------------------------------
+
+    def init_steps(self, serial_number: str | None) -> Steps:
+        """The ten steps of chapter III; GET_MODE confirms a mode change, which nothing acknowledges."""
+        self.flow = None
+        self._noise.clear()
+        self._check_serial_number(serial_number)
+        yield from self._enter_config_mode()
+        yield from self._identify(serial_number)
+        yield from self._configure()
+        levels = yield from self._set_limits()
+        yield from self._enter_normal_mode()
+        yield from self._start_controller()
+        if levels:
+            assert self._levels_prefix is not None
+            ask, prefix = message(COMMAND, GET), self._levels_prefix
+        else:
+            log.info(
+                "firmware does not tell how full its transmit buffer is: fewer frames are sent at a time"
+            )
+            ask, prefix = message(GET_MODE), self.sync.prefix
+        self.flow = Flow(ask, prefix, CAPACITY, self._critical, self._ready)
+
+    def close_steps(self) -> Steps:
+        """CONFIG_MODE and reset mode (chapter III), once what it has taken is on the bus or would not go."""
+        if self.flow and self._levels_prefix:
+            for _ in range(LEVEL_LOOKS):
+                levels = yield from self._read_levels()
+                if levels is None or not levels.waiting:
+                    break
+        self.flow = None
+        for _ in range(2):
+            answer = yield self._mode_exchange(message(CONFIG_MODE), CONFIG)
+            if answer.reply is TEXT:
+                break
+        yield _exchange(
+            message(WRITE_REG, MOD, RESET_MODE),
+            "take its controller off the bus",
+            bytes((WRITE_REG, 1, MOD)),
+            optional=True,
+        )
+
+    def _mode_exchange(self, request: bytes, mode: int) -> Exchange:
+        """A request that nothing acknowledges, and GET_MODE, whose answer comes when it is done."""
+        return _exchange(
+            request + message(GET_MODE),
+            f"enter mode {MODE_NAMES[mode]}",
+            bytes((GET_MODE, 1, mode)),
+            optional=True,
+        )
+
+    def _enter_config_mode(self) -> Steps:
+        for _ in range(MODE_TRIES):
+            answer = yield self._mode_exchange(message(CONFIG_MODE), CONFIG)
+            if answer.reply is TEXT:
+                return
+        if TRIPLE.search(self._noise):
+            msg = f"the device on {self._port} is a CANLAB Triple: its protocol is not that of the USB2CAN"
+            raise WrongDeviceError(msg)
+        heard = f"; it sent {len(self._noise)} bytes that are no USB2CAN messages" if self._noise else ""
+        msg = (
+            f"no answer to CONFIG_MODE and GET_MODE on {self._port}{heard}: is it the USB2CAN, and not "
+            f"another device with an FTDI chip? If it is, unplug it and plug it in again"
+        )
+        raise AdapterError(msg)
+
+    def _enter_normal_mode(self) -> Steps:
+        for _ in range(MODE_TRIES):
+            answer = yield self._mode_exchange(message(NORMAL_MODE), NORMAL)
+            if answer.reply is TEXT:
+                return
+        msg = f"the adapter on {self._port} does not enter mode NORMAL"
+        raise AdapterError(msg)
+
+    # --- who it is ----------------------------------------------------------------------------
+
+    def _check_serial_number(self, serial_number: str | None) -> None:
+        if self._wanted_serial is None or serial_number == self._wanted_serial:
+            return
+        has = (
+            f"has serial number {serial_number}" if serial_number else "has no serial number that can be read"
+        )
+        msg = f"the USB device behind {self._port} {has}, adapter.serial_number wants {self._wanted_serial}"
+        raise WrongDeviceError(msg)
+
+    def _identify(self, serial_number: str | None) -> Steps:
+        answer = yield _exchange(message(FW_VERSION), "tell its version", bytes((FW_VERSION, 12)))
+        version = answer.text[2:].decode("ascii", "replace")
+        parts = re.fullmatch(r"HW(\w{4})FW(\w)(\w{3})", version)
+        if not parts:
+            msg = f"the device on {self._port} answers FW_VERSION with {version!r}, not HWxxxxFWyzzz"
+            raise WrongDeviceError(msg)
+        self.identity = Identity(version, serial_number)
+        series = parts[2]
+        if series == FMS_SERIES:
+            msg = f"the device on {self._port} has FMS firmware ({version}), which makes it no CAN adapter"
+            raise WrongDeviceError(msg)
+        if series == LOAD_SERIES:
+            log.warning("adapter has firmware that loads the bus for tests (%s)", version)
+
+    # --- settings -----------------------------------------------------------------------------
+
+    def _write(self, name: str, address: int, value: int) -> Generator[Exchange, Answer, None]:
+        yield _exchange(
+            message(WRITE_REG, address, value),
+            f"write {value:#04x} to register {name} ({address})",
+            bytes((WRITE_REG, 1, address)),
+        )
+
+    @property
+    def _mode_bits(self) -> int:
+        """MOD as it is to be on the bus. Without a filter the mode is dual, as in the document."""
+        acceptance = self._channel.acceptance
+        return LISTEN_ONLY * self._channel.listen_only | SINGLE_FILTER * bool(
+            acceptance and acceptance.single
+        )
+
+    def _configure(self) -> Steps:
+        """Steps 2 to 7."""
+        acceptance = self._channel.acceptance
+        code, mask = (acceptance.code, acceptance.mask) if acceptance else (0, 0xFFFFFFFF)
+        btr0, btr1 = self._channel.timing.register_pair
+        yield from self._write("MOD", MOD, RESET_MODE)
+        if self._mode_bits:
+            # They can be changed in reset mode only: should NORMAL_MODE end it, they must be there already.
+            yield from self._write("MOD", MOD, RESET_MODE | self._mode_bits)
+        yield from self._write("CDR", CDR, 0xC0)
+        for i, value in enumerate(code.to_bytes(4, "big")):
+            yield from self._write(f"ACR{i}", ACR0 + i, value)
+        for i, value in enumerate(mask.to_bytes(4, "big")):
+            yield from self._write(f"AMR{i}", AMR0 + i, value)
+        yield from self._write("OCR", OCR, 0xDA)
+        yield from self._write("IER", IER, 0x03)
+        yield from self._write("BTR0", BTR0, btr0)
+        yield from self._write("BTR1", BTR1, btr1)
+
+    def _set_limits(self) -> Generator[Exchange, Answer, bool]:
+        """Step 8, so that ready < critical holds at every moment, and the counters for health.
+
+        Whether COMMAND GET tells how full the transmit buffer is: not said how in the document, so it is
+        believed only if it repeats the limits, and an idle buffer is empty.
+        """
+        critical, ready = (
+            message(COMMAND, CRITICAL_LIMIT, self._critical),
+            message(COMMAND, READY_LIMIT, self._ready),
+        )
+        before = yield from self._find_levels()
+        in_order = critical + ready if before is None or before.ready < self._critical else ready + critical
+        counters = message(COMMAND, ENABLE_READ_TEC) + message(COMMAND, ENABLE_READ_REC)
+        answer = yield self._mode_exchange(in_order + counters, CONFIG)
+        if answer.reply is NONE:
+            msg = f"the adapter on {self._port} stopped answering when its limits were set"
+            raise AdapterError(msg)
+        if before is None:
+            return False
+        after = yield from self._read_levels()
+        return after == Levels(self._critical, self._ready, 0)
+
+    def _find_levels(self) -> Generator[Exchange, Answer, Levels | None]:
+        """COMMAND GET, whose answer begins with its code or does not."""
+        for prefix in (bytes((COMMAND, 5, GET)), bytes((COMMAND, 4))):
+            self._levels_prefix = prefix
+            levels = yield from self._read_levels()
+            if levels:
+                return levels
+        self._levels_prefix = None
+        return None
+
+    def _read_levels(self) -> Generator[Exchange, Answer, Levels | None]:
+        assert self._levels_prefix is not None
+        answer = yield _exchange(message(COMMAND, GET), "tell its limits", self._levels_prefix, optional=True)
+        if answer.reply is NONE:
+            return None
+        critical, ready, first, second = answer.text[-4:]
+        return Levels(critical, ready, first + second)
+
+    def _start_controller(self) -> Steps:
+        """Step 10. A listener that acknowledges, or a filter of the other kind, must not go unnoticed."""
+        bits = self._mode_bits
+        yield from self._write("MOD", MOD, bits)
+        if not bits:
+            return
+        answer = yield _exchange(message(READ_REG, MOD), "tell register MOD", bytes((READ_REG, 2, MOD)))
+        if answer.text[-1] & (LISTEN_ONLY | SINGLE_FILTER) != bits:
+            found = f"MOD is {answer.text[-1]:#04x}, not {bits:#04x}"
+            msg = f"the adapter on {self._port} does not keep its listen-only or filter mode: {found}"
+            raise WrongDeviceError(msg)
+
+    # --- health -------------------------------------------------------------------------------
+
+    def status_request(self) -> Exchange:
+        """The SJA1000's status register."""
+        return _exchange(
+            message(READ_REG, SR), "tell its status register", bytes((READ_REG, 2, SR)), optional=True
+        )
+
+    def describe_status(self, answer: Answer) -> str:
+        if answer.reply is NONE:
+            return "unknown"
+        value = answer.text[-1]
+        if value & BUS_STATUS:
+            return "bus-off"
+        return (
+            "error counters above 95"
+            if value & ERROR_STATUS_BIT
+            else "no errors, its transmit buffer is full"
+        )
+
+    def describe_report(self, text: bytes) -> str | None:
+        """BUS_OFF, ERROR STATUS, and a mode that a running device must not have."""
+        if text[0] == BUS_OFF:
+            return f"bus-off, it restarts by itself ({_describe_registers(text[2:])})"
+        if text[0] == ERROR and text[2] == ERROR_STATUS:
+            return f"error counters crossed the warning limit ({_describe_registers(text[3:])})"
+        if text[0] == GET_MODE and self.flow and text[2] != NORMAL:
+            return f"mode {MODE_NAMES[text[2]]}: it was reset, or another program uses it"
+        return None
+
+    def saw_time_stamps(self) -> None:
+        """Firmware of series 5 and 6 has them, and sends them always."""
+
+    def saw_noise(self, noise: bytes) -> None:
+        self._noise += noise[: NOISE_KEPT - len(self._noise)]
+
+
+def _describe_registers(data: bytes) -> str:
+    """SR, ALC, ECC, REC, TEC, as BUS_OFF and ERROR STATUS have them."""
+    return f"TEC={data[4]} REC={data[3]} SR={data[0]:#04x} ECC={data[2]:#04x}"

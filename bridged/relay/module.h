@@ -1,0 +1,14 @@
+/* What the two files that know Python share. */
+#ifndef CAN_BRIDGE_MODULE_H
+#define CAN_BRIDGE_MODULE_H
+
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include "codec.h"
+
+const struct codec *codec_by_name(const char *name); /* NULL with ValueError */
+PyObject *module_decode(PyObject *module, PyObject *args);
+PyObject *module_encode(PyObject *module, PyObject *args);
+
+#endif

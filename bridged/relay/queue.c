@@ -1,0 +1,115 @@
+/* Frames from the bus that wait for the device: those not sent yet, and those it did not take. */
+#include "relay.h"
+
+static struct tx_frame *waiting_at(struct relay *r, uint32_t i)
+{
+    return &r->queue[(r->queue_head + i) % r->set.queue];
+}
+
+static struct tx_frame *retry_at(struct relay *r, uint32_t i)
+{
+    return &r->retry[(r->retry_head + i) % RETRY_MAX];
+}
+
+const struct tx_frame *retry_first(struct relay *r)
+{
+    return retry_at(r, 0);
+}
+
+struct tx_frame queue_pop(struct relay *r)
+{
+    struct tx_frame tx = *waiting_at(r, 0);
+    r->queue_head = (r->queue_head + 1) % r->set.queue;
+    r->queue_count--;
+    return tx;
+}
+
+struct tx_frame retry_pop(struct relay *r)
+{
+    struct tx_frame tx = *retry_at(r, 0);
+    r->retry_head = (r->retry_head + 1) % RETRY_MAX;
+    r->retry_count--;
+    return tx;
+}
+
+void queue_drop(struct relay *r, enum tx_drop reason)
+{
+    r->count.tx_dropped[reason]++;
+}
+
+/* Both lists are in order of age, so only their heads need a look. */
+void queue_expire(struct relay *r, int64_t now)
+{
+    while (r->retry_count && now - retry_at(r, 0)->born_ns > r->set.deadline_ns) {
+        retry_pop(r);
+        queue_drop(r, TX_REFUSED);
+    }
+    while (r->queue_count && now - waiting_at(r, 0)->born_ns > r->set.deadline_ns) {
+        queue_pop(r);
+        queue_drop(r, TX_STALE);
+    }
+}
+
+/* A frame from the bus: into the queue, or dropped for what the gate says. */
+void queue_add(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now)
+{
+    static const enum tx_drop closed[GATES] = {
+        [GATE_AWAY] = TX_AWAY, [GATE_LISTEN_ONLY] = TX_LISTEN_ONLY, [GATE_STOPPED] = TX_STOPPED};
+
+    if (r->gate != GATE_OPEN) {
+        queue_drop(r, closed[r->gate]);
+        return;
+    }
+    if (r->queue_count == r->set.queue)
+        queue_expire(r, now);
+    if (r->queue_count == r->set.queue) {
+        queue_drop(r, TX_QUEUE_FULL);
+        return;
+    }
+    struct tx_frame *tx = waiting_at(r, r->queue_count++);
+    tx->frame = *frame;
+    tx->born_ns = born_ns;
+    tx->number = r->next_number++;
+}
+
+/* Frames that wait survive the adapter's absence until their deadline; nothing else does. */
+void queue_set_gate(struct relay *r, enum gate gate)
+{
+    r->gate = gate;
+    if (gate != GATE_STOPPED && gate != GATE_LISTEN_ONLY)
+        return;
+    enum tx_drop reason = gate == GATE_STOPPED ? TX_STOPPED : TX_LISTEN_ONLY;
+    for (; r->retry_count; retry_pop(r))
+        queue_drop(r, reason);
+    for (; r->queue_count; queue_pop(r))
+        queue_drop(r, reason);
+}
+
+/* Whether frames wait that may be sent. */
+bool queue_waiting(const struct relay *r)
+{
+    return r->gate == GATE_OPEN && !r->silent && (r->retry_count || r->queue_count);
+}
+
+/* Puts a frame that was not taken back into its place before those not sent yet. */
+void queue_retry(struct relay *r, const struct tx_frame *tx)
+{
+    uint32_t i = r->retry_count++;
+    for (; i && retry_at(r, i - 1)->number > tx->number; i--)
+        *retry_at(r, i) = *retry_at(r, i - 1);
+    *retry_at(r, i) = *tx;
+}
+
+/* A frame was taken: an earlier one with its identifier that was not must not follow it. */
+void queue_overtake(struct relay *r, const struct tx_frame *taken)
+{
+    uint32_t kept = 0;
+    for (uint32_t i = 0; i < r->retry_count; i++) {
+        const struct tx_frame *tx = retry_at(r, i);
+        if (tx->number < taken->number && tx->frame.can_id == taken->frame.can_id)
+            queue_drop(r, TX_OVERTAKEN);
+        else
+            *retry_at(r, kept++) = *tx;
+    }
+    r->retry_count = kept;
+}

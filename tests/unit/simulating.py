@@ -1,0 +1,115 @@
+"""What the tests of the simulator in real time share: it runs, a host, a clock that a test sets."""
+
+import contextlib
+import os
+import select
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import bridged
+from bridged.simulators.can232 import Can232
+from bridged.simulators.serve import USB2CAN_FAULTS, Device, Simulator, parse_fault
+
+TIMEOUT_S = 20
+
+
+@contextlib.contextmanager
+def running(simulator: Simulator) -> Iterator[Simulator]:
+    thread = threading.Thread(target=simulator.run)
+    thread.start()
+    try:
+        yield simulator
+    finally:
+        simulator.stop()
+        thread.join(TIMEOUT_S)
+        assert not thread.is_alive()
+
+
+@contextlib.contextmanager
+def host(port: str | Path) -> Iterator[int]:
+    fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    try:
+        tty.setraw(fd)
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def read(fd: int, length: int) -> bytes:
+    """So many bytes, or what there was when time was up."""
+    data = b""
+    deadline = time.monotonic() + TIMEOUT_S
+    while len(data) < length and select.select([fd], [], [], max(0, deadline - time.monotonic()))[0]:
+        piece = os.read(fd, length - len(data))
+        if not piece:
+            break
+        data += piece
+    return data
+
+
+def ask(fd: int, commands: bytes, answer: bytes) -> None:
+    os.write(fd, commands)
+    assert read(fd, len(answer)) == answer
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        select.select([], [], [], 0.002)
+
+
+class HandClock:
+    """A clock that a test sets; it wakes the simulator to see it."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.simulator: Simulator | None = None
+
+    def __call__(self) -> float:
+        return self.now
+
+    def set(self, now: float) -> None:
+        assert self.simulator
+        self.now = now
+        self.simulator.request_state()
+
+
+def by_hand(device: Device | None = None, *faults: str, **options: object) -> tuple[Simulator, HandClock]:
+    clock = HandClock()
+    clock.simulator = Simulator(
+        device or Can232(),
+        faults=[parse_fault(text, USB2CAN_FAULTS) for text in faults],
+        clock=clock,
+        **options,  # type: ignore[arg-type]
+    )
+    return clock.simulator, clock
+
+
+@contextlib.contextmanager
+def process(tmp_path: Path, adapter: str, *options: str) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "bridged", "simulate", adapter, "--link", f"{tmp_path}/tty"]
+    root = Path(bridged.__file__).parents[1]
+    with subprocess.Popen([*command, "--state", f"{tmp_path}/state", *options], cwd=root) as child:
+        try:
+            until(lambda: (tmp_path / "tty").is_symlink() or child.poll() is not None)
+            yield child
+        finally:
+            child.kill()
+
+
+def count_calls(where: object, name: str) -> list[None]:
+    calls: list[None] = []
+    method = getattr(where, name)
+
+    def counted(*arguments: object) -> object:
+        calls.append(None)
+        return method(*arguments)
+
+    setattr(where, name, counted)
+    return calls

@@ -1,0 +1,74 @@
+"""What /sys and /proc tell of a tty: the serial number of the USB device that it is, its timer, its users."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from bridged.ports import open_port, sysfs
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(sysfs, "_SYS", tmp_path / "sys")
+    return tmp_path
+
+
+@pytest.fixture
+def tty(machine: Path) -> Path:
+    """…/usb1/1-4/1-4:1.0/ttyUSB0/tty/ttyUSB0, with a hub above that has a serial number, too."""
+    hub = machine / "sys/devices/usb1"
+    tty = hub / "1-4/1-4:1.0/ttyUSB0/tty/ttyUSB0"
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to("../..")
+    for device, number in ((hub, "0000:00:04.0"), (hub / "1-4", "A6001234")):
+        (device / "idVendor").write_text("0403\n")
+        (device / "serial").write_text(f"{number}\n")
+    return tty
+
+
+def test_serial_number(tty: Path) -> None:
+    assert sysfs.serial_number(tty) == "A6001234"
+    (tty.parents[3] / "serial").unlink()
+    assert sysfs.serial_number(tty) is None  # and not the hub's
+
+
+def test_no_usb_device(machine: Path) -> None:
+    assert sysfs.serial_number(machine) is None
+
+
+def test_latency_timer(tty: Path) -> None:
+    assert sysfs.latency_ms(tty) is None
+    (tty.parents[1] / "latency_timer").write_text("16\n")
+    assert sysfs.latency_ms(tty) == 16
+
+
+def test_by_the_number_of_the_device(tty: Path, machine: Path) -> None:
+    with Path("/dev/null").open("rb") as null:
+        number = os.fstat(null.fileno()).st_rdev
+        assert sysfs.tty_directory(null.fileno()) is None
+        link = machine / f"sys/dev/char/{os.major(number)}:{os.minor(number)}"
+        link.parent.mkdir(parents=True)
+        link.symlink_to(tty)
+        assert sysfs.tty_directory(null.fileno()) == tty
+
+
+def test_users(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert sysfs.users(file) == []
+    with file.open("rb"):
+        assert [user.endswith(f"(process {os.getpid()})") for user in sysfs.users(file)] == [True]
+
+
+def test_ports_that_are_no_usb_devices() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = open_port(f"socket://127.0.0.1:{listener.getsockname()[1]}", 57600)
+        assert port.serial_number is None
+        port.close()
+    port = open_port("loop://", 57600)
+    assert port.serial_number is None
+    port.close()
