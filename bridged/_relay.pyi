@@ -30,8 +30,8 @@ class Relay:
     """Relays frames between a port (bytes) and a bus (datagrams of struct can_frame).
 
     Times are seconds. `window`: how many frames and commands may be unanswered. `deadline`: a frame
-    older than this is not sent. `sync`: a command whose answer, a text that begins with `sync_prefix`, cannot be
-    taken for any other answer; sent to find the thread again after an answer was lost.
+    older than this is not sent. `sync`: a command whose answer, a text that begins with `sync_prefix`,
+    cannot be taken for any other answer; sent to find the thread again after an answer was lost.
     Descriptors stay the caller's to close, after they were detached.
     Raises ValueError for settings out of range, OSError when descriptors or memory run out.
     """

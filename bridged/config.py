@@ -36,8 +36,10 @@ Baudrate = Annotated[int, Meta(ge=50, le=4_000_000, description="a UART rate fro
 SerialNumber = Annotated[
     str, Meta(pattern="^[!-~]{1,32}$", description="the serial number that the device reports")
 ]
-CriticalLimit = Annotated[int, Meta(ge=1, le=18, description="a number of frames from 1 to 18")]
-ReadyLimit = Annotated[int, Meta(ge=0, le=17, description="a number of frames from 0 to 17")]
+CriticalLimit = Annotated[int, Meta(ge=2, le=18, description="a number of frames from 2 to 18")]
+ReadyLimit = Annotated[
+    int, Meta(ge=1, le=17, description="a number of frames from 1 to 17")
+]  # below 1 never "go"
 Bitrate = Annotated[
     int,
     Meta(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -22,7 +23,7 @@ START = 0x0F
 CONFIG_MODE, NORMAL_MODE, GET_MODE = 2, 3, 6
 BUS_OFF, ERROR, ERROR_STATUS = 8, 9, 1
 READ_REG, WRITE_REG, COMMAND, FW_VERSION = 16, 18, 32, 33
-CRITICAL_LIMIT, READY_LIMIT, ENABLE_READ_TEC, ENABLE_READ_REC, GET = 0, 1, 2, 3, 128
+CRITICAL_LIMIT, READY_LIMIT, GET = 0, 1, 128
 BOOT, CONFIG, NORMAL = 0, 1, 2  # what GET_MODE tells
 MODE_NAMES = ("BOOT", "CONFIG", "NORMAL", "LOOPBACK")
 
@@ -35,7 +36,8 @@ CAPACITY = 18
 
 ANSWER_TIMEOUT_S: Final = 0.3
 MODE_TRIES = 5  # a half message of another program swallows up to 16 bytes, one try has 6
-LEVEL_LOOKS = 20  # at the transmit buffer, until the channel is closed all the same
+DRAIN_LOOKS = 10  # at a transmit buffer that no frame leaves, until the channel is closed all the same
+DRAIN_INTERVAL_S: Final = 0.01  # between two of them; the longest frame takes 15 ms at 10 kbit/s
 NOISE_KEPT = 256  # bytes
 FMS_SERIES, LOAD_SERIES = "7", "2"  # of the firmware: the y of HWxxxxFWyzzz
 
@@ -110,13 +112,10 @@ class Usb2can:
     def close_steps(self) -> Steps:
         """CONFIG_MODE and reset mode (chapter III), once what it has taken is on the bus or would not go."""
         if self.flow and self._levels_prefix:
-            for _ in range(LEVEL_LOOKS):
-                levels = yield from self._read_levels()
-                if levels is None or not levels.waiting:
-                    break
+            yield from self._drain()
         self.flow = None
         for _ in range(2):
-            answer = yield self._mode_exchange(message(CONFIG_MODE), CONFIG)
+            answer = yield self._in_config_mode(message(CONFIG_MODE))
             if answer.reply is TEXT:
                 break
         yield _exchange(
@@ -126,18 +125,26 @@ class Usb2can:
             optional=True,
         )
 
-    def _mode_exchange(self, request: bytes, mode: int) -> Exchange:
+    def _drain(self) -> Steps:
+        """Waits while frames leave its transmit buffer; a pause is a question whose answer is not awaited."""
+        fewest, looks = math.inf, DRAIN_LOOKS
+        while looks:
+            levels = yield from self._read_levels()
+            if levels is None or not levels.waiting:
+                return
+            looks = DRAIN_LOOKS if levels.waiting < fewest else looks - 1
+            fewest = min(fewest, levels.waiting)
+            yield Exchange(message(GET_MODE), "wait", (NONE,), (), timeout_s=DRAIN_INTERVAL_S)
+
+    def _in_config_mode(self, request: bytes) -> Exchange:
         """A request that nothing acknowledges, and GET_MODE, whose answer comes when it is done."""
         return _exchange(
-            request + message(GET_MODE),
-            f"enter mode {MODE_NAMES[mode]}",
-            bytes((GET_MODE, 1, mode)),
-            optional=True,
+            request + message(GET_MODE), "enter mode CONFIG", bytes((GET_MODE, 1, CONFIG)), optional=True
         )
 
     def _enter_config_mode(self) -> Steps:
         for _ in range(MODE_TRIES):
-            answer = yield self._mode_exchange(message(CONFIG_MODE), CONFIG)
+            answer = yield self._in_config_mode(message(CONFIG_MODE))
             if answer.reply is TEXT:
                 return
         if TRIPLE.search(self._noise):
@@ -151,10 +158,18 @@ class Usb2can:
         raise AdapterError(msg)
 
     def _enter_normal_mode(self) -> Steps:
+        """NORMAL_MODE is not for mode NORMAL (the table in chapter II): again only if it was not obeyed."""
+        request = message(NORMAL_MODE)
         for _ in range(MODE_TRIES):
-            answer = yield self._mode_exchange(message(NORMAL_MODE), NORMAL)
-            if answer.reply is TEXT:
+            answer = yield _exchange(
+                request + message(GET_MODE), "enter mode NORMAL", bytes((GET_MODE, 1)), optional=True
+            )
+            if answer.reply is NONE:  # it may be lost
+                request = b""
+            elif answer.text[2] == NORMAL:
                 return
+            else:
+                request = message(NORMAL_MODE)
         msg = f"the adapter on {self._port} does not enter mode NORMAL"
         raise AdapterError(msg)
 
@@ -221,19 +236,16 @@ class Usb2can:
         yield from self._write("BTR1", BTR1, btr1)
 
     def _set_limits(self) -> Generator[Exchange, Answer, bool]:
-        """Step 8, so that ready < critical holds at every moment, and the counters for health.
+        """Step 8, so that ready < critical holds at every moment, whatever the limits were.
 
         Whether COMMAND GET tells how full the transmit buffer is: not said how in the document, so it is
         believed only if it repeats the limits, and an idle buffer is empty.
         """
-        critical, ready = (
-            message(COMMAND, CRITICAL_LIMIT, self._critical),
-            message(COMMAND, READY_LIMIT, self._ready),
-        )
+        limits = message(COMMAND, CRITICAL_LIMIT, self._critical) + message(COMMAND, READY_LIMIT, self._ready)
         before = yield from self._find_levels()
-        in_order = critical + ready if before is None or before.ready < self._critical else ready + critical
-        counters = message(COMMAND, ENABLE_READ_TEC) + message(COMMAND, ENABLE_READ_REC)
-        answer = yield self._mode_exchange(in_order + counters, CONFIG)
+        if before is None or before.ready >= self._critical:
+            limits = message(COMMAND, READY_LIMIT, 0) + limits  # 0 is below any critical limit
+        answer = yield self._in_config_mode(limits)
         if answer.reply is NONE:
             msg = f"the adapter on {self._port} stopped answering when its limits were set"
             raise AdapterError(msg)

@@ -18,7 +18,7 @@
  * Where messages begin, nothing tells for certain: data may hold anything. As long as each begins where the
  * one before ended it is taken at once. Where none begins, there is doubt:
  *   1. Bytes may have been lost. Then the last message took the first bytes of the next as its own data, and
- *      that begins within it: in 0F 41 05 02 24 60 AB 0F 12 01 06, at the last 0F. So each is kept until then.
+ *      that begins within it: in 0F 41 05 02 24 60 AB 0F 12 01 06, at the last 0F. So each is kept for that.
  *   2. Otherwise bytes are skipped up to where a message begins. An answer or event is taken there at once:
  *      the device may say nothing more until it is asked. A frame must be confirmed, and so must anything
  *      under 1: by what may be a message just after it.
@@ -146,7 +146,7 @@ static bool all_printable(const uint8_t *at, size_t n)
     return true;
 }
 
-/* Whether at[0..n), all that is there of DATA, contradicts COMMAND and LENGTH (n <= length). */
+/* Whether at[0..n), all that is there yet, may be DATA of this LENGTH; so do the next two (n <= length). */
 static bool received_possible(const uint8_t *at, size_t n, size_t length)
 {
     return n == 0 || (frame_bytes(at[0]) == length && (n <= id_bytes(at[0]) || id_clean(at)));
@@ -215,7 +215,9 @@ static enum codec_kind error_kind(const uint8_t *data)
 {
     if (data[0] == ERROR_CRITICAL_TRANSMIT)
         return data[1] == 1 ? CODEC_STOP : data[1] == 0 ? CODEC_GO : CODEC_IDLE;
-    return data[0] == ERROR_CAN_TRANSMIT ? CODEC_RETURNED : data[0] == ERROR_STATUS ? CODEC_TEXT : CODEC_OVERRUN;
+    if (data[0] == ERROR_CAN_TRANSMIT)
+        return CODEC_RETURNED;
+    return data[0] == ERROR_STATUS ? CODEC_TEXT : CODEC_OVERRUN;
 }
 
 /* Of a message that has been measured. */

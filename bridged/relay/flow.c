@@ -12,6 +12,7 @@
 #define ASK_LAST_NS INT64_C(16000000)
 #define STOP_LOOK_NS INT64_C(50000000)   /* how often the level is looked at while stopped: "go" may be lost */
 #define STOP_LIMIT_NS INT64_C(500000000) /* after this a stop without a start ends by trial */
+#define ASK_EVERY 4 /* frames: so that what is known of the buffer is not a whole round trip old */
 #define RETURNS_TOLD 64
 
 bool flow_used(const struct relay *r)
@@ -69,17 +70,27 @@ bool flow_ready(const struct relay *r)
 bool flow_ask_due(const struct relay *r, bool more, int64_t now)
 {
     const struct flow *f = &r->flow;
-    if (!f->ask.length || f->asking)
+    if (!f->ask.length || f->asking == QUESTIONS_MAX)
         return false;
-    if (f->sent_count)
-        return !more;
-    return queue_waiting(r) && (f->stopped || !f->room) && now >= f->ask_at_ns;
+    if (f->uncovered)
+        return !more || f->uncovered >= ASK_EVERY;
+    return now >= flow_deadline(r);
 }
 
 void flow_asked(struct relay *r)
 {
-    r->flow.asking = true;
-    r->flow.asked = r->flow.sent_count;
+    struct flow *f = &r->flow;
+    f->covered[(f->covered_head + f->asking++) % QUESTIONS_MAX] = f->uncovered;
+    f->uncovered = 0;
+}
+
+/* The oldest question is over: how many frames it covers. */
+static uint32_t question_pop(struct flow *f)
+{
+    uint32_t covered = f->covered[f->covered_head];
+    f->covered_head = (f->covered_head + 1) % QUESTIONS_MAX;
+    f->asking--;
+    return covered;
 }
 
 void flow_sent(struct relay *r, const struct tx_frame *tx)
@@ -88,6 +99,7 @@ void flow_sent(struct relay *r, const struct tx_frame *tx)
     if (!f->sent_count)
         f->noise = r->count.skipped_bytes;
     *sent_at(f, f->sent_count++) = *tx;
+    f->uncovered++;
     f->room--;
 }
 
@@ -106,20 +118,24 @@ static void ask_again_at(struct flow *f, int64_t now)
 void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now)
 {
     struct flow *f = &r->flow;
-    bool certain = r->count.skipped_bytes == f->noise;
+    bool grows = false;
+    if (r->count.skipped_bytes != f->noise)
+        f->doubted = f->sent_count;
     f->noise = r->count.skipped_bytes;
-    f->asking = false;
-    for (; f->asked; f->asked--) {
+    for (uint32_t n = question_pop(f); n; n--) {
         const struct tx_frame taken = sent_pop(f);
-        if (!certain) {
+        if (f->doubted) {
+            f->doubted--;
             queue_drop(r, TX_UNANSWERED);
             continue;
         }
         r->count.confirmed++;
         queue_overtake(r, &taken);
         f->ask_delay_ns = ASK_FIRST_NS;
-        f->limit += f->limit < r->set.window;
+        grows = !f->settling;
     }
+    if (grows)
+        f->limit = 2 * f->limit < r->set.window ? 2 * f->limit : r->set.window;
     f->settling = f->settling && f->sent_count;
 
     int level = r->set.codec->level(msg->text, msg->length);
@@ -137,9 +153,9 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
 void flow_unanswered(struct relay *r)
 {
     struct flow *f = &r->flow;
-    f->asking = false;
-    for (; f->asked; f->asked--) {
+    for (uint32_t n = question_pop(f); n; n--) {
         sent_pop(f);
+        f->doubted -= f->doubted > 0;
         queue_drop(r, TX_UNANSWERED);
     }
     f->room = 0;
@@ -150,6 +166,21 @@ static bool frames_equal(const struct can_frame *a, const struct can_frame *b)
 {
     size_t data = a->can_id & CAN_RTR_FLAG ? 0 : a->len;
     return a->can_id == b->can_id && a->len == b->len && !memcmp(a->data, b->data, data);
+}
+
+/* The i-th of `sent` is no longer one of those that its question covers. */
+static void uncover(struct flow *f, uint32_t i)
+{
+    uint32_t past = 0;
+    for (uint32_t question = 0; question < f->asking; question++) {
+        uint32_t *covered = &f->covered[(f->covered_head + question) % QUESTIONS_MAX];
+        past += *covered;
+        if (i < past) {
+            --*covered;
+            return;
+        }
+    }
+    f->uncovered--;
 }
 
 /* Handed back: into its place before those not sent yet. One that is not ours is not sent. */
@@ -164,12 +195,13 @@ static void frame_returned(struct relay *r, const struct can_frame *frame, int64
         return;
     }
     struct tx_frame tx = *sent_at(f, i);
-    f->asked -= i < f->asked;
+    uncover(f, i);
+    f->doubted -= i < f->doubted;
     for (; i + 1 < f->sent_count; i++)
         *sent_at(f, i) = *sent_at(f, i + 1);
     f->sent_count--;
     f->room = 0;
-    f->limit = f->limit > 1 ? f->limit / 2 : 1;
+    f->limit = 1;
     f->settling = f->sent_count;
     ask_again_at(f, now);
     if (r->count.returned++ % RETURNS_TOLD == 0)

@@ -77,7 +77,7 @@ def latency_timer(tty: str) -> int:
 def plug() -> Iterator[Callable[[str], FakeFt245]]:
     """Makes chips behind vhci-hcd, plugged in; its terminal is there."""
     if not ftdi_vhci.load_driver():
-        pytest.skip("this kernel has no vhci-hcd")
+        pytest.skip("this kernel has no vhci-hcd, or does not let us use it")
     chips = []
 
     def plug(serial_number: str) -> FakeFt245:
@@ -204,7 +204,7 @@ class TestChipThatSendsEmptyPackets:
 
     def test_two_alike_are_told_apart(self, plug: Callable[[str], FakeFt245]) -> None:
         chips = {number: plug(number) for number in ("PY000003", "PY000004")}
-        with pytest.raises(PortError, match=r"of them: add a serial number \(PY000003, PY000004[,)]"):
+        with pytest.raises(PortError, match=r"of them: add a serial number \(.*PY000003, PY000004"):
             open_port("usb://0403:6001", 57600)
         ports = {number: open_port(f"usb://0403:6001/{number}", 57600) for number in chips}
         for number, chip in chips.items():
@@ -212,7 +212,7 @@ class TestChipThatSendsEmptyPackets:
             assert exchange(ports[number].fd, b"", len(number)) == number.encode()
         for port in ports.values():
             port.close()
-        with pytest.raises(PortError, match=r"no such USB device: there is PY000003, PY000004[,]?"):
+        with pytest.raises(PortError, match=r"no such USB device: there is .*PY000003, PY000004"):
             open_port("usb://0403:6001/PY000009", 57600)
 
     def test_in_use(self, plug: Callable[[str], FakeFt245]) -> None:
@@ -220,7 +220,7 @@ class TestChipThatSendsEmptyPackets:
         address, tty = "usb://0403:6001/PY000005", wait_tty("PY000005")
         program = (
             "from bridged.ports import open_port\n"
-            f"open_port({tty!r}, 57600)\n"
+            f"port = open_port({tty!r}, 57600)\n"
             "print('open', flush=True)\n"
             "input()\n"
         )
@@ -243,7 +243,7 @@ class TestChipThatSendsEmptyPackets:
     def test_no_permission(self, plug: Callable[[str], FakeFt245]) -> None:
         plug("PY000006")
         program = (
-            "import os; os.setgid(65534); os.setuid(65534)\n"
+            "import os; os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
             "from bridged.errors import PortError; from bridged.ports import open_port\n"
             "try: open_port('usb://0403:6001/PY000006', 57600)\n"
             "except PortError as error: print(error)\n"

@@ -223,7 +223,7 @@ def test_what_an_example_has_in_comments_is_right_too(file: Path, example: Path)
         (usb2can_port("usb://0403:6001/1E5, serial_number: 1E5"), "adapter.serial_number", "1E5"),
         (usb2can_port("usb://0403:6001/1E5"), "adapter.serial_number", None),
         (usb2can("critical_limit: 8"), "adapter.critical_limit", 8),
-        (usb2can("critical_limit: 1, ready_limit: 0"), "adapter.critical_limit", 1),
+        (usb2can("critical_limit: 2, ready_limit: 1"), "adapter.critical_limit", 2),
         (usb2can("ready_limit: 14"), "adapter.ready_limit", 14),
         (usb2can("ready_limit: 17, critical_limit: 0x12"), "adapter.critical_limit", 18),
         (four_lines("{type: usb2can, port: /dev/x}", more="transmit: {window: 32, deadline: 0.001}"), "transmit.window", 32),
@@ -283,8 +283,8 @@ WORD = "a number from 0x00000000 to 0xFFFFFFFF is wanted"
 NAME = "the name of an interface has"
 DEADLINE = "a number of seconds above 0 and up to 3600 is wanted"
 USB = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, is wanted, not"
-CRITICAL = "a number of frames from 1 to 18 is wanted"
-READY = "a number of frames from 0 to 17 is wanted"
+CRITICAL = "a number of frames from 2 to 18 is wanted"
+READY = "a number of frames from 1 to 17 is wanted"
 SERIAL_NUMBER = "the serial number that the device reports is wanted"
 SINGLE = "a single value, or a list of single values, is wanted"
 
@@ -341,11 +341,11 @@ SINGLE = "a single value, or a list of single values, is wanted"
         (usb2can_port, "usb://٠٤٠٣:6001", f"{USB} 'usb://٠٤٠٣:6001'"),
         (usb2can_port, "usb://0403:6001/" + "A" * 33, f"{USB} 'usb://0403:6001/{'A' * 24}…'"),
         (usb2can, "serial_number: A 1", f"{SERIAL_NUMBER}, not the text 'A 1'"),
-        (usb2can, "critical_limit: 0", f"{CRITICAL}, not 0"),
+        (usb2can, "critical_limit: 1", f"{CRITICAL}, not 1"),
         (usb2can, "critical_limit: 19", f"{CRITICAL}, not 19"),
         (usb2can, "ready_limit: 16, critical_limit: 15.5", f"{CRITICAL}, not 15.5"),
-        (usb2can, "critical_limit: 1, ready_limit: 18", f"{READY}, not 18"),
-        (usb2can, "ready_limit: -1", f"{READY}, not -1"),
+        (usb2can, "critical_limit: 2, ready_limit: 18", f"{READY}, not 18"),
+        (usb2can, "ready_limit: 0", f"{READY}, not 0"),
         (usb2can, "ready_limit: off", f"{READY}, not the yes-or-no value 'off'"),
         (usb2can, "ready_limit: null", f"is empty; {READY}, or remove the key"),
         (usb2can, "critical_limit: 7", "a limit above ready_limit (7, its default) is wanted, not 7"),

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from usb2can_words import (
+    BOOT,
     CONFIG,
     FRAME,
     FRAME_S,
@@ -282,3 +283,61 @@ def test_a_deadline_is_never_missed_and_never_without_effect():
         outcomes.append((output, frames, device.report()))
         assert step or wakes < 80
     assert outcomes[0] == outcomes[1]
+
+
+def test_what_is_due_happens_before_a_fault_does():
+    for fault, then in (
+        (lambda device: device.garbage(1, b"x"), b"x"),
+        (lambda device: device.value_2_burst(1, 1), VALUE_2),
+        (lambda device: device.overrun(1), OVERRUN),
+        (lambda device: device.set_error_counters(1, 0, 96), b"\x0f\x09\x06\x01\0\0\x60\0\x4c"),
+        (lambda device: device.set_bus_off(1, True), b"\x0f\x08\x06\xcc\0\0\0\x7f\xcc"),
+        (lambda device: device.bus_frame(1, FRAME), RECEIVED),
+    ):
+        device = opened()
+        device.processing_s = 0.5
+        device.host_writes(0, bytes.fromhex(GET_MODE))
+        fault(device)
+        assert device.take_output(1) == bytes.fromhex("0F060102") + then
+
+
+def test_what_is_due_happens_before_the_power_fails():
+    device = opened()
+    device.host_writes(0, WRITTEN * 2)
+    device.power_off(1.5 * FRAME_S)
+    assert (device.counters.frames_sent, device.counters.frames_discarded) == (1, 1)
+
+
+def test_the_power_failure_takes_with_it_what_is_on_its_way():
+    device = opened()
+    device.processing_s = 1
+    device.bus_frame(0, FRAME)
+    device.host_writes(0, bytes.fromhex(GET_MODE))
+    device.power_off(0.5)
+    assert device.take_output(0.5) == b""
+    device.power_on(0.6)
+    assert device.take_output(5) == b""
+
+
+def test_seconds_count_from_power_on():
+    device = opened(version="HW0003FW5001")
+    device.power_off(1)
+    device.power_on(5.25)
+    ask(device, OPEN, 5.5)
+    assert device.next_deadline() == 6.25
+    device.bus_frame(6, FRAME)
+    assert messages(device.take_output(6)) == [(63, WRITTEN[3:] + (3000).to_bytes(2, "little"))]
+
+
+def test_64_frames_wait_for_the_host():
+    device = opened()
+    for _ in range(65):
+        device.bus_frame(0, FRAME)
+    assert device.take_output(0) == RECEIVED * 64 + OVERRUN
+
+
+def test_after_boot_mode_there_is_no_bus():
+    device = opened()
+    ask(device, BOOT)
+    device.bus_frame(0, FRAME)
+    assert (device.take_output(1), device.counters.frames_unseen) == (b"", 1)

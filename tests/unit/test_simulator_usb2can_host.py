@@ -336,3 +336,19 @@ def test_whatever_happens_no_frame_is_unaccounted_for(actions: list[tuple[str, o
         assert counters.stops >= counters.gos or device.violations
         assert device.next_deadline() >= now
         json.dumps(device.report())
+
+
+def test_a_message_has_16_data_bytes_at_most():
+    device = Usb2can()
+    ask(device, CONFIG)
+    assert hexed(device, "0F1310" + "0F" * 16 + GET_MODE) == "0F060101"
+    assert device.counters.bytes_skipped == 0
+
+
+def test_reading_again_does_not_put_a_stop_off():
+    device = Usb2can(stop_grace_s=0.001)
+    ask(device, OPEN.replace(reg(6, 0x40), reg(6, 0x03)))  # 125 kbit/s
+    assert ask(device, WRITTEN.hex() * 16) == STOP
+    assert hexed(device, GET_MODE, 0.0009) == "0F060102"
+    device.host_writes(0.0011, WRITTEN)
+    assert len(device.violations) == 1

@@ -1,0 +1,638 @@
+"""The USB2CAN's adapter without I/O: what it says to the simulated device, in virtual time."""
+
+import logging
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+import pytest
+from usb2can_words import LOOPBACK, OPEN, SETUP, WRITTEN, ask, opened, reg
+
+from bridged import _relay
+from bridged.adapters.base import Answer, Reply, Steps
+from bridged.adapters.usb2can import BUS_OFF, ERROR, GET_MODE, READ_REG, SR, Usb2can
+from bridged.can import AcceptanceFilter, BitTiming, bit_timing
+from bridged.config import ChannelConfig, Usb2canConfig
+from bridged.errors import AdapterError, WrongDeviceError
+from bridged.simulators.sja1000 import MOD, Frame
+from bridged.simulators.usb2can import State
+from bridged.simulators.usb2can import Usb2can as Device
+
+BITRATES = (10_000, 20_000, 50_000, 83_333, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+PAIRS = [(critical, ready) for critical in range(1, 19) for ready in range(critical)]
+LISTEN_ONLY, SINGLE = 0x02, 0x08  # bits of MOD
+MODES = {"boot": "", "config": "0F0200", "normal": OPEN, "loopback": SETUP + LOOPBACK}
+
+MANUAL_START = """\
+CONFIG_MODE
+WRITE_REG 0 0x01
+WRITE_REG 31 0xC0
+WRITE_REG 16 0x00
+WRITE_REG 17 0x00
+WRITE_REG 18 0x00
+WRITE_REG 19 0x00
+WRITE_REG 20 0xFF
+WRITE_REG 21 0xFF
+WRITE_REG 22 0xFF
+WRITE_REG 23 0xFF
+WRITE_REG 8 0xDA
+WRITE_REG 4 0x03
+WRITE_REG 6 0x03
+WRITE_REG 7 0x1C
+COMMAND 0 15
+COMMAND 1 7
+NORMAL_MODE
+WRITE_REG 0 0x00
+""".splitlines()
+MANUAL_END = ["CONFIG_MODE", "WRITE_REG 0 0x01"]
+QUERIES = ("GET_MODE", "FW_VERSION", "COMMAND 128", "READ_REG")
+
+
+class Line(Protocol):
+    """What a Host asks of a device."""
+
+    def host_writes(self, now: float, data: bytes) -> None: ...
+    def take_output(self, now: float) -> bytes: ...
+    def next_deadline(self) -> float: ...
+
+
+class Parrot:
+    """Another device: says the same to everything."""
+
+    def __init__(self, words: bytes) -> None:
+        self._words = words
+        self._output = b""
+
+    def host_writes(self, _now: float, _data: bytes) -> None:
+        self._output += self._words
+
+    def take_output(self, _now: float) -> bytes:
+        output, self._output = self._output, b""
+        return output
+
+    def next_deadline(self) -> float:
+        return float("inf")
+
+
+class Host:
+    """Performs the steps of an adapter as bridge.py and the relay do; `now` is its clock."""
+
+    def __init__(self, device: Line, adapter: Usb2can) -> None:
+        self.device = device
+        self.adapter = adapter
+        self.now = 0.0
+        self.asked = 0  # exchanges
+        self.before_each: Callable[[int], None] = lambda _number: None
+        self._heard: list[bytes] = []
+        self._decoded = 0  # messages in them
+
+    def start(self, steps_wanted: int = 1000) -> None:
+        self.perform(self.adapter.init_steps("A6008isP"), steps_wanted)
+
+    def close(self) -> None:
+        self.perform(self.adapter.close_steps())
+
+    def perform(self, steps: Steps, wanted: int = 1000) -> None:
+        """AdapterError for an answer that is not accepted, too; `wanted` steps, no more."""
+        self.asked = 0
+        answer = None
+        while self.asked < wanted:
+            try:
+                exchange = steps.send(answer) if answer else next(steps)
+            except StopIteration:
+                return
+            assert self.asked < 200, "it asks for ever"
+            self.before_each(self.asked)
+            self.asked += 1
+            assert 1 <= len(exchange.request) <= 64  # see relay.h
+            assert len(exchange.prefix) <= 4
+            answer = self._ask(exchange.request, exchange.prefix, exchange.timeout_s)
+            assert (answer.reply in exchange.accept) != (answer.reply in exchange.reject)
+            if answer.reply in exchange.reject:
+                raise AdapterError(f"did not answer the request to {exchange.purpose}")
+
+    def _ask(self, request: bytes, prefix: bytes, timeout_s: float) -> Answer:
+        until = self.now + timeout_s
+        self.device.host_writes(self.now, request)
+        while True:
+            answers = [text for text in self._texts() if prefix and text.startswith(prefix)]
+            if answers:
+                return Answer(Reply.TEXT, answers[0])
+            if self.device.next_deadline() > until:
+                self.now = until
+                return Answer(Reply.NONE)
+            self.now = max(self.now, self.device.next_deadline())
+
+    def _texts(self) -> list[bytes]:
+        output = self.device.take_output(self.now)
+        if not output:
+            return []
+        self._heard.append(output)
+        messages = _relay.decode("usb2can", self._heard)[self._decoded :]
+        self._decoded += len(messages)
+        if messages and {kind for kind, _, _ in messages} == {"skipped"}:
+            self.adapter.saw_noise(output)
+        return [text for kind, text, _ in messages if kind == "text"]
+
+
+def channel(timing: BitTiming = BitTiming(125_000), **options: Any) -> ChannelConfig:
+    return ChannelConfig(timing=timing, **options)
+
+
+def adapter_for(channel_: ChannelConfig | None = None, **options: Any) -> Usb2can:
+    config = Usb2canConfig(type="usb2can", port="/dev/ttyUSB0", **options)
+    return Usb2can(config, channel_ or channel(), None)  # type: ignore[arg-type]  # it remembers nothing
+
+
+def started(device: Device, adapter: Usb2can | None = None) -> Host:
+    host = Host(device, adapter or adapter_for())
+    host.start()
+    return host
+
+
+def settings(device: Device) -> list[str]:
+    return [line for line in device.record if not line.startswith(QUERIES)]
+
+
+def assert_open(device: Device, mod: int = 0x00, bitrate: float = 125_000) -> None:
+    chip = device.chip
+    assert device.state is State.NORMAL
+    assert chip.read(MOD) == mod
+    assert chip.bitrate == pytest.approx(bitrate, rel=1e-5)
+    assert (device.critical, device.ready) == (15, 7)
+
+
+def assert_closed(device: Device) -> None:
+    assert device.state is State.CONFIG
+    assert device.chip.in_reset
+
+
+def complaints(device: Device) -> list[str]:
+    """Its violations. Step 2 is `0x01` to the letter; what only reset mode can change is set besides it."""
+    return [text for text in device.violations if text not in BITS_OF_STEP_2]
+
+
+BITS_OF_STEP_2 = [f"NORMAL_MODE: MOD = 0x{bits | 1:02X}, not 0x01 (step 2)" for bits in (2, 8, 10)]
+
+
+@pytest.fixture(params=[0.0, 0.002], ids=["at-once", "slow"])
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    """Power has just come; at the end it has nothing to complain of."""
+    made = Device(processing_s=request.param)
+    yield made
+    assert complaints(made) == []
+
+
+# --- what the manual says, literally ----------------------------------------------------------
+
+
+def test_it_starts_with_the_ten_steps_and_ends_with_the_two(device: Device) -> None:
+    host = started(device)
+    assert settings(device) == MANUAL_START
+    assert_open(device)
+    host.close()
+    assert settings(device) == MANUAL_START + MANUAL_END
+    assert_closed(device)
+    assert device.violations == []
+
+
+def test_a_second_session_is_as_the_first(device: Device) -> None:
+    host = started(device)
+    host.close()
+    host.start()
+    assert settings(device) == MANUAL_START + MANUAL_END + MANUAL_START
+    assert device.violations == []
+
+
+def test_the_last_words_close_it_too(device: Device) -> None:
+    host = started(device)
+    device.host_writes(host.now, host.adapter.last_words)
+    device.advance(host.now + 1)
+    assert settings(device) == MANUAL_START + MANUAL_END
+
+
+@pytest.mark.parametrize("bitrate", BITRATES)
+def test_bit_rates(device: Device, bitrate: int) -> None:
+    registers = bit_timing(bitrate) if bitrate == 83_333 else None
+    started(device, adapter_for(channel(BitTiming(bitrate, registers))))
+    assert_open(device, bitrate=bitrate)
+
+
+def test_btr0_and_btr1(device: Device) -> None:
+    started(device, adapter_for(channel(BitTiming.from_registers(0x40, 0x1C))))
+    assert {"WRITE_REG 6 0x40", "WRITE_REG 7 0x1C"} < set(device.record)
+    assert_open(device, bitrate=500_000)
+
+
+@pytest.mark.parametrize("listen_only", [False, True])
+@pytest.mark.parametrize("single", [False, True])
+def test_filter_and_listen_only(device: Device, listen_only: bool, single: bool) -> None:
+    acceptance = AcceptanceFilter(0x12345678, 0x9ABCDEF0, single)
+    started(device, adapter_for(channel(listen_only=listen_only, acceptance=acceptance)))
+    assert_open(device, LISTEN_ONLY * listen_only | SINGLE * single)
+    assert device.chip.code == bytes.fromhex("12345678")
+    assert device.chip.mask == bytes.fromhex("9ABCDEF0")
+
+
+def test_a_listener_is_one_before_it_can_be_on_the_bus(device: Device) -> None:
+    started(device, adapter_for(channel(listen_only=True)))
+    written = [line for line in settings(device) if line.startswith(("WRITE_REG 0", "NORMAL"))]
+    assert written == ["WRITE_REG 0 0x01", "WRITE_REG 0 0x03", "NORMAL_MODE", "WRITE_REG 0 0x02"]
+
+
+def test_a_device_that_does_not_listen_only_is_refused() -> None:
+    class Talker(Device):
+        def _write(self, address: int, value: int) -> None:
+            super()._write(address, value & ~LISTEN_ONLY if address == MOD else value)
+
+    device = Talker()
+    host = Host(device, adapter_for(channel(listen_only=True)))
+    with pytest.raises(WrongDeviceError, match=r"does not keep its listen-only .*: MOD is 0x00, not 0x02"):
+        host.start()
+    host.close()
+    assert_closed(device)
+    assert device.violations == []
+
+
+# --- limits -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("answers_get", [True, False])
+@pytest.mark.parametrize("wanted", [(15, 7), (1, 0), (2, 1), (18, 0), (18, 17)])
+def test_ready_is_below_critical_whatever_they_were(wanted: tuple[int, int], answers_get: bool) -> None:
+    for before in PAIRS:
+        device = Device(answers_get=answers_get)
+        for critical, ready in (before, wanted):
+            started(device, adapter_for(critical_limit=critical, ready_limit=ready))
+            assert (device.critical, device.ready) == (critical, ready)
+        assert device.violations == []
+
+
+@pytest.mark.parametrize("before", [(15, 7), (1, 0), (18, 17)])
+def test_every_pair_of_limits(before: tuple[int, int]) -> None:
+    device = Device()
+    for critical, ready in PAIRS:
+        started(device, adapter_for(critical_limit=before[0], ready_limit=before[1]))
+        started(device, adapter_for(critical_limit=critical, ready_limit=ready))
+        assert (device.critical, device.ready) == (critical, ready)
+    assert device.violations == []
+
+
+@pytest.mark.parametrize(
+    ("options", "question", "prefix"),
+    [
+        ({}, "0F 20 01 80", "20 05 80"),
+        ({"get_length_4": True}, "0F 20 01 80", "20 04"),
+        ({"answers_get": False}, "0F 06 00", "06 01 02"),
+    ],
+)
+def test_what_asks_how_full_it_is(options: dict[str, bool], question: str, prefix: str) -> None:
+    device = Device(**options)  # type: ignore[arg-type]
+    flow = started(device).adapter.flow
+    assert flow
+    assert (flow.request, flow.prefix) == (bytes.fromhex(question), bytes.fromhex(prefix))
+    assert (flow.capacity, flow.critical, flow.ready) == (18, 15, 7)
+    assert_open(device)
+    assert device.violations == []
+
+
+@pytest.mark.parametrize("answer", ["80 07 0F 00 00", "80 0F 07 01 00", "80 00 00 0F 07", "0F 07 00 00 00"])
+def test_parameters_that_are_not_what_was_set_are_not_believed(answer: str) -> None:
+    class Odd(Device):
+        def _get(self) -> bytes:
+            return bytes.fromhex(answer)
+
+    device = Odd()
+    flow = started(device).adapter.flow
+    assert flow
+    assert flow.request == bytes.fromhex("0F 06 00")
+    assert_open(device)
+    assert device.violations == []
+
+
+# --- whatever it was doing --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_from_every_mode(device: Device, mode: str) -> None:
+    ask(device, MODES[mode])
+    device.advance(1.0)
+    host = Host(device, adapter_for())
+    host.now = 1.0
+    host.start()
+    assert_open(device)
+    assert settings(device)[-len(MANUAL_START) :] == MANUAL_START
+
+
+HALVES = [
+    *(bytes.fromhex("0F 40 0D 88 00 00 0F 78 0F 06 00 0F 02 00 0F 06")[:n] for n in range(1, 16)),
+    *(bytes.fromhex("0F 10 01")[:n] for n in range(2, 4)),
+    *(bytes.fromhex("0F 12 02 00")[:n] for n in range(2, 5)),
+    *(bytes.fromhex("0F 20 02 00")[:n] for n in range(2, 5)),
+    bytes.fromhex("0F 40 10"),
+]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("half", HALVES, ids=lambda half: half.hex())
+def test_half_a_message_of_another_program_costs_one_message(mode: str, half: bytes) -> None:
+    device = Device()
+    ask(device, MODES[mode])
+    device.host_writes(0.0, half)
+    assert device.violations == []
+    host = started(device)
+    assert_open(device)
+    # What it makes of that half and the beginning of ours was none of our words.
+    assert len(device.violations) <= 1
+    assert host.now < 1.5
+    host.close()
+    assert_closed(device)
+
+
+@pytest.mark.parametrize("junk", ["", "FF", "FFFF", "0F", "0F41", "0F0601", "0F0FFF", "00" * 64, "0F410B08"])
+@pytest.mark.parametrize("quirks", [True, False])
+def test_junk_at_power_on(junk: str, quirks: bool) -> None:
+    device = Device(junk=bytes.fromhex(junk), quirks=quirks)
+    started(device)
+    assert_open(device)
+    assert device.violations == []
+
+
+@pytest.mark.parametrize("series", "0123456")
+def test_a_device_that_receives_and_reports_meanwhile(series: str) -> None:
+    device = Device(version=f"HW0003FW{series}016")
+    ask(device, OPEN)
+    host = Host(device, adapter_for())
+
+    def bus(number: int) -> None:
+        for n in range(20):
+            device.bus_frame(host.now, Frame(n, n % 2 > 0, False, 8, b"\x0f\x06\x01\x02\x0f\x12\x01\x00"))
+        device.overrun(host.now)
+        device.value_2_burst(host.now, 3)
+        device.set_error_counters(host.now, 100 * (number % 2), 0)
+
+    host.before_each = bus
+    for _ in range(2):
+        host.now += 1.5  # for TIMESTAMP
+        host.start()
+        assert_open(device)
+        host.close()
+        assert_closed(device)
+    assert host.adapter.identity.version == f"HW0003FW{series}016"
+    assert host.adapter.identity.serial_number == "A6008isP"
+    assert device.violations == []
+
+
+def test_firmware_that_loads_the_bus_is_remarked(device: Device, caplog: pytest.LogCaptureFixture) -> None:
+    started(device)
+    assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
+    loader = Device(version="HW0003FW2016")
+    started(loader)
+    assert "loads the bus for tests (HW0003FW2016)" in caplog.text
+    assert loader.violations == []
+
+
+# --- what is no USB2CAN -----------------------------------------------------------------------
+
+
+def refused(device: Device, adapter: Usb2can | None = None) -> str:
+    """Why; and it is closed all the same."""
+    host = Host(device, adapter or adapter_for())
+    with pytest.raises(WrongDeviceError) as caught:
+        host.start()
+    host.close()
+    assert_closed(device)
+    assert device.violations == []
+    return str(caught.value)
+
+
+def test_fms_firmware_is_refused() -> None:
+    assert "FMS firmware (HW0003FW7016)" in refused(Device(version="HW0003FW7016"))
+
+
+@pytest.mark.parametrize("version", ["HW0003XX0016", "            ", "TRIPLE V1.00"])
+def test_what_has_another_kind_of_version_is_refused(version: str) -> None:
+    class Other(Device):
+        def _fw_version(self, _data: bytes) -> bytes:
+            return version.encode()
+
+    assert f"FW_VERSION with '{version}'" in refused(Other())
+
+
+@pytest.mark.parametrize(
+    ("serial_number", "words"),
+    [("A600XXXX", "has serial number A600XXXX"), (None, "has no serial number that can be read")],
+)
+def test_a_wrong_serial_number_is_refused_before_a_word_is_said(
+    serial_number: str | None, words: str
+) -> None:
+    device = Device()
+    host = Host(device, adapter_for(serial_number="A6008isP"))
+    with pytest.raises(WrongDeviceError, match=f"{words}, adapter.serial_number wants A6008isP"):
+        host.perform(host.adapter.init_steps(serial_number))
+    assert (host.asked, device.record) == (0, [])
+    host.start()
+    assert_open(device)
+    assert device.violations == []
+
+
+@pytest.mark.parametrize("words", ["0F01020304EF", "0F21054142431F0FEF", "0F80EF" * 3])
+def test_a_triple_is_refused(words: str) -> None:
+    host = Host(Parrot(bytes.fromhex(words)), adapter_for())
+    with pytest.raises(WrongDeviceError, match="is a CANLAB Triple"):
+        host.start()
+    host.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "heard"), [(b"", "/dev/ttyUSB0: is it"), (b"\a", "sent 5 bytes"), (b"V1011\r", "sent 30 bytes")]
+)
+def test_what_does_not_answer_is_an_error(words: bytes, heard: str) -> None:
+    host = Host(Parrot(words), adapter_for())
+    with pytest.raises(AdapterError, match="no answer to CONFIG_MODE and GET_MODE") as caught:
+        host.start()
+    assert not isinstance(caught.value, WrongDeviceError)
+    assert heard in str(caught.value)
+    assert host.now == pytest.approx(1.5)
+    host.close()
+    assert host.now < 2.5
+
+
+def test_noise_is_kept_up_to_a_bound_and_from_this_start_only() -> None:
+    host = Host(Parrot(bytes.fromhex("0F01020304EF")), adapter_for())
+    with pytest.raises(WrongDeviceError):
+        host.start()
+    host.device = Parrot(b"\xff" * 100)
+    with pytest.raises(AdapterError, match="it sent 256 bytes") as caught:
+        host.start()
+    assert not isinstance(caught.value, WrongDeviceError)
+
+
+# --- lost answers, stops ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"listen_only": True}], ids=["default", "listen-only"])
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_lost_answers_do_no_harm(options: dict[str, bool], count: int) -> None:
+    mod = LISTEN_ONLY if options else 0x00
+    number_of_steps = started(Device(), adapter_for(channel(**options))).asked
+    assert number_of_steps > 20
+    for lost in range(number_of_steps):
+        device = Device()
+        host = Host(device, adapter_for(channel(**options)))
+
+        def lose(number: int, device: Device = device, lost: int = lost) -> None:
+            device.drop_answers = count if number == lost else device.drop_answers
+
+        host.before_each = lose
+        try:
+            host.start()
+        except AdapterError as error:
+            assert not isinstance(error, WrongDeviceError)  # noqa: PT017 - it may also end well
+        else:
+            assert_open(device, mod)
+        assert host.now < 5
+        device.drop_answers = 0
+        host.before_each = lambda _number: None
+        host.close()
+        assert_closed(device)
+        host.start()
+        assert_open(device, mod)
+        assert complaints(device) == []
+
+
+def test_a_lost_answer_to_normal_mode_is_asked_for_again(device: Device) -> None:
+    host = Host(device, adapter_for())
+
+    def lose(_number: int) -> None:
+        if settings(device)[-1:] == ["COMMAND 1 7"] and device.record[-1] == "COMMAND 128":
+            device.drop_answers = 1
+
+    host.before_each = lose
+    host.start()
+    assert device.counters.answers_dropped == 1
+    assert settings(device) == MANUAL_START
+    assert_open(device)
+
+
+def test_stopped_at_any_step_it_is_closed() -> None:
+    number_of_steps = started(Device()).asked
+    for mode in MODES:
+        for steps in range(number_of_steps + 1):
+            device = Device()
+            ask(device, MODES[mode])
+            host = Host(device, adapter_for())
+            host.start(steps)
+            host.close()
+            assert settings(device)[-2:] == MANUAL_END
+            assert_closed(device)
+            assert device.violations == []
+
+
+def test_a_device_that_was_reset_is_closed_without_a_wrong_word(device: Device) -> None:
+    host = started(device)
+    device.power_cycle(host.now)
+    host.close()
+    assert_closed(device)
+    host.start()
+    assert_open(device)
+
+
+# --- the frames that it has taken -------------------------------------------------------------
+
+
+def test_frames_in_its_buffer_are_on_the_bus_before_it_is_closed() -> None:
+    device = Device(version="HW0003FW3016")
+    host = started(device, adapter_for(channel(BitTiming(10_000))))
+    for _ in range(40):
+        device.host_writes(host.now, WRITTEN)
+        device._forget_stop()  # its host is of the worst kind
+    begin = host.now
+    host.close()
+    assert (device.counters.frames_sent, device.counters.frames_discarded) == (40, 0)
+    assert 0.2 < host.now - begin < 1.0
+    assert_closed(device)
+    assert device.violations == []
+
+
+def test_frames_that_cannot_leave_do_not_keep_it_open() -> None:
+    device = Device()
+    host = started(device)
+    device.set_bus_off(host.now, True)
+    device.host_writes(host.now, WRITTEN * 5)
+    begin = host.now
+    host.close()
+    assert device.counters.frames_discarded == 5
+    assert host.now - begin < 0.3
+    assert_closed(device)
+    assert device.violations == []
+
+
+def test_a_silent_device_is_not_waited_for() -> None:
+    device = opened()
+    host = started(device)
+    device.silent = True
+    begin = host.now
+    host.close()
+    assert host.now - begin < 1.5
+    assert_closed(device)
+    assert device.violations == []
+
+
+# --- words ------------------------------------------------------------------------------------
+
+
+def test_status() -> None:
+    adapter = adapter_for()
+    request = adapter.status_request()
+    assert (request.request, request.prefix) == (bytes.fromhex("0F 10 01 02"), bytes((READ_REG, 2, SR)))
+
+    def described(status: int) -> str:
+        return adapter.describe_status(Answer(Reply.TEXT, bytes((READ_REG, 2, SR, status))))
+
+    assert adapter.describe_status(Answer(Reply.NONE)) == "unknown"
+    assert described(0xC0) == "bus-off"
+    assert described(0x40) == "error counters above 95"
+    assert described(0x0C) == "no errors, its transmit buffer is full"
+
+
+def test_reports() -> None:
+    device = Device()
+    adapter = started(device).adapter
+    describe = adapter.describe_report
+    registers = bytes((0xC0, 1, 2, 0, 127))
+    texts = [bytes((BUS_OFF, 5)) + registers, bytes((BUS_OFF, 6)) + registers + b"\xc0"]
+    for text in texts:
+        assert describe(text) == "bus-off, it restarts by itself (TEC=127 REC=0 SR=0xc0 ECC=0x02)"
+    crossed = "error counters crossed the warning limit (TEC=96 REC=3 SR=0x40 ECC=0x19)"
+    for end in (b"", b"\x40"):
+        text = bytes((ERROR, 6 + len(end), 1, 0x40, 0, 0x19, 3, 96)) + end
+        assert describe(text) == crossed
+    assert describe(bytes((GET_MODE, 1, 2))) is None
+    assert describe(bytes((GET_MODE, 1, 0))) == "mode BOOT: it was reset, or another program uses it"
+    assert describe(bytes((GET_MODE, 1, 3))) == "mode LOOPBACK: it was reset, or another program uses it"
+    assert describe(bytes((0x12, 1, 0))) is None
+    assert adapter_for().describe_report(bytes((GET_MODE, 1, 0))) is None  # not running: nothing to it
+    assert device.violations == []
+
+
+def test_what_the_device_reports_can_be_described() -> None:
+    device = Device()
+    adapter = started(device).adapter
+    device.set_error_counters(1.0, 96, 3)
+    device.set_bus_off(1.0, True)
+    texts = [text for _, text, _ in _relay.decode("usb2can", [device.take_output(1.0)])]
+    assert [str(adapter.describe_report(text)).split(" (")[0] for text in texts] == [
+        "error counters crossed the warning limit",
+        "bus-off, it restarts by itself",
+    ]
+    assert device.violations == []
+
+
+def test_only_mode_normal_answers_the_sync(device: Device) -> None:
+    host = started(device)
+    sync = host.adapter.sync
+    assert host._ask(sync.request, sync.prefix, sync.timeout_s).reply is Reply.TEXT
+    device.power_cycle(host.now)
+    assert host._ask(sync.request, sync.prefix, sync.timeout_s).reply is Reply.NONE
+    ask(device, reg(MOD, 1), host.now)  # it is unaware of the reset: no violation
+    assert device.state is State.BOOT
