@@ -140,7 +140,7 @@ def channel(timing: BitTiming = BitTiming(125_000), **options: Any) -> ChannelCo
 
 def adapter_for(channel_: ChannelConfig | None = None, **options: Any) -> Usb2can:
     config = Usb2canConfig(type="usb2can", port="/dev/ttyUSB0", **options)
-    return Usb2can(config, channel_ or channel(), None)  # type: ignore[arg-type]  # it remembers nothing
+    return Usb2can(config, channel_ or channel())
 
 
 def started(device: Device, adapter: Usb2can | None = None) -> Host:

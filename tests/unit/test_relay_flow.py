@@ -1,4 +1,4 @@
-"""The window of a USB2CAN, against the simulated device on a line with latency, on a clock of the test's own."""
+"""The window of a USB2CAN, against the simulated device behind a latency, on a clock of the test's own."""
 
 import contextlib
 import socket
@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridged import _relay
-from bridged.adapters.base import Reply, Steps
-from bridged.adapters.base import Answer
+from bridged.adapters.base import Answer, Reply, Steps
 from bridged.adapters.usb2can import Usb2can as Adapter
 from bridged.can import BitTiming
 from bridged.config import ChannelConfig, Usb2canConfig
@@ -26,16 +25,6 @@ EFF, RTR = 0x80000000, 0x40000000
 LATENCY_NS = 700 * US  # each way: USB
 STEP_NS = 125 * US
 STOP = bytes.fromhex("0F 09 02 02 01")
-
-
-class NoMemory:
-    """A USB2CAN has nothing that must be remembered."""
-
-    def recall(self, serial_number: str, setting: str) -> int | None:
-        raise AssertionError
-
-    def remember(self, serial_number: str, setting: str, value: int) -> None:
-        raise AssertionError
 
 
 def packed(frame: Frame) -> bytes:
@@ -60,7 +49,7 @@ class Rig:
         )  # a stop takes its time to the host, frames to the device
         self.device = Usb2can(1.0, stop_grace_s=stop_grace_s, **device)
         adapter = Usb2canConfig(type="usb2can", port="/dev/sim")
-        self.adapter = Adapter(adapter, ChannelConfig(timing=BitTiming(bitrate)), NoMemory())
+        self.adapter = Adapter(adapter, ChannelConfig(timing=BitTiming(bitrate)))
         self.relay = _relay.Relay(
             "usb2can",
             queue=4096,
