@@ -15,7 +15,7 @@ def make_adapter(config: Config, memory: Memory) -> Adapter:
     if adapter.type == "usb2can":
         from bridged.adapters.usb2can import Usb2can  # noqa: PLC0415
 
-        return Usb2can(adapter, config.channel, memory)
+        return Usb2can(adapter, config.channel)
     from bridged.adapters.can232 import Can232  # noqa: PLC0415
 
     return Can232(adapter, config.channel, memory)

@@ -7,7 +7,7 @@ import math
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from bridged.adapters.base import Answer, Exchange, Flow, Identity, Memory, Polling, Reply, Steps
+from bridged.adapters.base import Answer, Exchange, Flow, Identity, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Usb2can:
     polling: Polling | None = None
     last_words = message(CONFIG_MODE) + message(WRITE_REG, MOD, RESET_MODE)
 
-    def __init__(self, adapter: Usb2canConfig, channel: ChannelConfig, _memory: Memory) -> None:
+    def __init__(self, adapter: Usb2canConfig, channel: ChannelConfig) -> None:
         self._port = adapter.port
         self._wanted_serial = adapter.serial_number
         self._critical = adapter.critical_limit
