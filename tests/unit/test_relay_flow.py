@@ -1,6 +1,7 @@
 """The window of a USB2CAN, against the simulated device behind a latency, on a clock of the test's own."""
 
 import contextlib
+import math
 import socket
 import struct
 from collections import Counter, defaultdict, deque
@@ -65,6 +66,7 @@ class Rig:
             s.setblocking(False)
         self._down: deque[tuple[int, bytes]] = deque()  # to the device: when it arrives
         self._up: deque[tuple[int, bytes]] = deque()
+        self._relay_next: int | None = None
         self.corrupt = False  # what the device says next loses a byte
         self.sent: list[Frame] = []  # by the device, on its bus
         self.received: list[bytes] = []  # from the relay, on the host's bus
@@ -104,8 +106,15 @@ class Rig:
     def run(self, seconds: float) -> None:
         end = self.now + round(seconds * S)
         while self.now < end:
-            self.now += STEP_NS
+            self.now = min(end, max(self.now + STEP_NS, self._next()))
             self._step()
+
+    def _next(self) -> int:
+        """When something happens that nobody has to be told of."""
+        device = self.device.next_deadline()
+        times = [self._relay_next, *(pipe[0][0] for pipe in (self._up, self._down) if pipe)]
+        times.append(math.ceil(device * S) if device < math.inf else None)
+        return min((time for time in times if time is not None), default=1 << 62)
 
     def run_until_done(self, limit_s: float = 60.0) -> dict[str, int]:
         """Until nothing is queued and the device has sent everything."""
@@ -120,7 +129,7 @@ class Rig:
         now_s = self.now / S
         while self._up and self._up[0][0] <= self.now:
             self.port.send(self._up.popleft()[1])
-        self.relay.turn(self.now)
+        self._relay_next = self.relay.turn(self.now)
         with contextlib.suppress(BlockingIOError):
             self._down.append((self.now + LATENCY_NS, self.port.recv(1 << 16)))
         while self._down and self._down[0][0] <= self.now:
@@ -143,7 +152,7 @@ class Rig:
     def send(self, *frames: Frame) -> None:
         for frame in frames:
             self.bus.send(packed(frame))
-            self.relay.turn(self.now)
+            self._relay_next = self.relay.turn(self.now)
 
     def counters(self) -> dict[str, int]:
         """The counters, flat, with the books checked."""
@@ -375,7 +384,7 @@ FAULTS = st.sampled_from(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.lists(st.tuples(FAULTS, st.integers(0, 30), st.integers(0, 40)), max_size=12),
     st.sampled_from([{}, {"answers_get": False}, {"tx_buffer": 3}]),
