@@ -106,7 +106,7 @@ class Usb2can:
             log.info(
                 "firmware does not tell how full its transmit buffer is: fewer frames are sent at a time"
             )
-            ask, prefix = message(GET_MODE), self.sync.prefix
+            ask, prefix = message(READ_REG, MOD), bytes((READ_REG, 2, MOD))
         self.flow = Flow(ask, prefix, CAPACITY, self._critical, self._ready)
 
     def close_steps(self) -> Steps:
@@ -309,7 +309,9 @@ class Usb2can:
         if text[0] == BUS_OFF:
             return f"bus-off, it restarts by itself ({_describe_registers(text[2:])})"
         if text[0] == ERROR and text[2] == ERROR_STATUS:
-            return f"error counters crossed the warning limit ({_describe_registers(text[3:])})"
+            # Bytes 1 to 5 are those of BUS_OFF, so that SR, which is its byte 0 too, comes last.
+            registers = text[3:] if text[1] > 6 else text[-1:] + text[3:]
+            return f"error counters crossed the warning limit ({_describe_registers(registers)})"
         if text[0] == GET_MODE and self.flow and text[2] != NORMAL:
             return f"mode {MODE_NAMES[text[2]]}: it was reset, or another program uses it"
         return None
@@ -322,5 +324,5 @@ class Usb2can:
 
 
 def _describe_registers(data: bytes) -> str:
-    """SR, ALC, ECC, REC, TEC, as BUS_OFF and ERROR STATUS have them."""
+    """SR, ALC, ECC, REC, TEC, as BUS_OFF has them."""
     return f"TEC={data[4]} REC={data[3]} SR={data[0]:#04x} ECC={data[2]:#04x}"

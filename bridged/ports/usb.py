@@ -197,7 +197,7 @@ class _Chip:
 def strip_status(transfer: memoryview, packet_size: int) -> bytes:
     """Drop the two status bytes of each packet: 01 60 'A' 'B' -> 'A' 'B'; all packets but the last are full.
 
-    FTDI application note AN232B-03, section 2; the kernel's ftdi_process_packet().
+    As the kernel's ftdi_process_read_urb() has it.
     """
     if len(transfer) <= packet_size:
         return bytes(transfer[_STATUS_BYTES:])

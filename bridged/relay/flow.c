@@ -12,7 +12,6 @@
 #define ASK_LAST_NS INT64_C(16000000)
 #define STOP_LOOK_NS INT64_C(50000000)   /* how often the level is looked at while stopped: "go" may be lost */
 #define STOP_LIMIT_NS INT64_C(500000000) /* after this a stop without a start ends by trial */
-#define ASK_EVERY 4 /* frames: so that what is known of the buffer is not a whole round trip old */
 #define RETURNS_TOLD 64
 
 bool flow_used(const struct relay *r)
@@ -66,31 +65,20 @@ bool flow_ready(const struct relay *r)
     return f->ask.length && !f->stopped && !f->settling && f->room && f->sent_count < f->limit;
 }
 
-/* Whether the question goes now. `more`: frames can follow at once, so that it can cover them too. */
+/* Whether the question goes now. `more`: frames can follow at once, so that it can cover them too.
+ * Never two at a time: should one be lost without a trace, the answer to the next would pass for its own. */
 bool flow_ask_due(const struct relay *r, bool more, int64_t now)
 {
     const struct flow *f = &r->flow;
-    if (!f->ask.length || f->asking == QUESTIONS_MAX)
+    if (!f->ask.length || f->asking)
         return false;
-    if (f->uncovered)
-        return !more || f->uncovered >= ASK_EVERY;
-    return now >= flow_deadline(r);
+    return f->sent_count ? !more : now >= flow_deadline(r);
 }
 
 void flow_asked(struct relay *r)
 {
-    struct flow *f = &r->flow;
-    f->covered[(f->covered_head + f->asking++) % QUESTIONS_MAX] = f->uncovered;
-    f->uncovered = 0;
-}
-
-/* The oldest question is over: how many frames it covers. */
-static uint32_t question_pop(struct flow *f)
-{
-    uint32_t covered = f->covered[f->covered_head];
-    f->covered_head = (f->covered_head + 1) % QUESTIONS_MAX;
-    f->asking--;
-    return covered;
+    r->flow.asking = true;
+    r->flow.asked = r->flow.sent_count;
 }
 
 void flow_sent(struct relay *r, const struct tx_frame *tx)
@@ -99,7 +87,6 @@ void flow_sent(struct relay *r, const struct tx_frame *tx)
     if (!f->sent_count)
         f->noise = r->count.skipped_bytes;
     *sent_at(f, f->sent_count++) = *tx;
-    f->uncovered++;
     f->room--;
 }
 
@@ -114,6 +101,15 @@ static void ask_again_at(struct flow *f, int64_t now)
     f->ask_delay_ns *= f->ask_delay_ns < ASK_LAST_NS ? 2 : 1;
 }
 
+/* The oldest frame may have been taken or not. */
+static void sent_unanswered(struct relay *r)
+{
+    const struct tx_frame lost = sent_pop(&r->flow);
+    r->flow.doubted -= r->flow.doubted > 0;
+    queue_drop(r, TX_UNANSWERED);
+    queue_overtake(r, &lost);
+}
+
 /* Noise may have been a frame that was handed back: then nothing is certain. */
 void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now)
 {
@@ -122,13 +118,13 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
     if (r->count.skipped_bytes != f->noise)
         f->doubted = f->sent_count;
     f->noise = r->count.skipped_bytes;
-    for (uint32_t n = question_pop(f); n; n--) {
-        const struct tx_frame taken = sent_pop(f);
+    f->asking = false;
+    for (; f->asked; f->asked--) {
         if (f->doubted) {
-            f->doubted--;
-            queue_drop(r, TX_UNANSWERED);
+            sent_unanswered(r);
             continue;
         }
+        const struct tx_frame taken = sent_pop(f);
         r->count.confirmed++;
         queue_overtake(r, &taken);
         f->ask_delay_ns = ASK_FIRST_NS;
@@ -153,11 +149,10 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
 void flow_unanswered(struct relay *r)
 {
     struct flow *f = &r->flow;
-    for (uint32_t n = question_pop(f); n; n--) {
-        sent_pop(f);
-        f->doubted -= f->doubted > 0;
-        queue_drop(r, TX_UNANSWERED);
-    }
+    f->asking = false;
+    for (; f->asked; f->asked--)
+        sent_unanswered(r);
+    f->doubted = f->sent_count; /* and so may those after them */
     f->room = 0;
     f->settling = f->settling && f->sent_count;
 }
@@ -166,21 +161,6 @@ static bool frames_equal(const struct can_frame *a, const struct can_frame *b)
 {
     size_t data = a->can_id & CAN_RTR_FLAG ? 0 : a->len;
     return a->can_id == b->can_id && a->len == b->len && !memcmp(a->data, b->data, data);
-}
-
-/* The i-th of `sent` is no longer one of those that its question covers. */
-static void uncover(struct flow *f, uint32_t i)
-{
-    uint32_t past = 0;
-    for (uint32_t question = 0; question < f->asking; question++) {
-        uint32_t *covered = &f->covered[(f->covered_head + question) % QUESTIONS_MAX];
-        past += *covered;
-        if (i < past) {
-            --*covered;
-            return;
-        }
-    }
-    f->uncovered--;
 }
 
 /* Handed back: into its place before those not sent yet. One that is not ours is not sent. */
@@ -195,7 +175,7 @@ static void frame_returned(struct relay *r, const struct can_frame *frame, int64
         return;
     }
     struct tx_frame tx = *sent_at(f, i);
-    uncover(f, i);
+    f->asked -= i < f->asked;
     f->doubted -= i < f->doubted;
     for (; i + 1 < f->sent_count; i++)
         *sent_at(f, i) = *sent_at(f, i + 1);

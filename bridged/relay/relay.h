@@ -26,7 +26,6 @@ enum {
     RETRY_MAX = 64,       /* ring: refused frames wait here; never more than were in flight */
     COMMANDS_MAX = 32,    /* ring: commands from Python that wait for their turn */
     COMMAND_SIZE = 64,    /* bytes of one command */
-    QUESTIONS_MAX = 8,    /* ring: questions of a flow in flight */
     PREFIX_MAX = 4,       /* bytes by which a text is known to be a command's answer */
     EVENTS_MAX = 256,     /* ring: events that Python has not fetched yet */
     EVENTS_NEWS = 128,    /* of these for what nobody waits for; the rest is for answers and losses */
@@ -162,14 +161,12 @@ struct flow {
     uint32_t capacity, critical, ready; /* frames in the device's buffer: fit surely, stop above, go below */
     struct tx_frame sent[WINDOW_MAX]; /* ring: not known to be taken yet */
     uint32_t sent_head, sent_count;
-    uint32_t covered[QUESTIONS_MAX]; /* ring: how many of them each question in flight covers */
-    uint32_t covered_head, asking;
-    uint32_t uncovered;    /* sent after the last question */
+    uint32_t asked;        /* how many of them the question in flight covers */
     uint32_t room;         /* frames that fit surely */
     uint32_t limit;        /* of sent_count: 1 after frames came back, doubled until it is the window again */
     uint64_t noise;        /* counters.skipped_bytes when `sent` was empty or a question answered last */
     uint32_t doubted;      /* the oldest of `sent`: noise since may have been one handed back */
-    bool stopped;
+    bool asking, stopped;
     bool settling;         /* frames came back: none goes before the fate of the others is known */
     int64_t stopped_ns;    /* since when */
     int64_t ask_at_ns, ask_delay_ns; /* while nothing can go */

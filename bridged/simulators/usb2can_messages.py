@@ -45,15 +45,15 @@ MODE_NUMBERS = {state: number for number, state in enumerate(State)}
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """How devices differ; ValueError if the version is none."""
+    """How devices differ, in the words of `Usb2can`; ValueError if the version is none."""
 
-    version: str = "HW0003FW0016"
-    tx_buffer: int = 20
-    quirks: bool = True
-    answers_get: bool = True
-    get_length_4: bool = False
-    padded: bool = False
-    stamp_order: Literal["little", "big"] = "little"
+    version: str
+    tx_buffer: int
+    quirks: bool
+    answers_get: bool
+    get_length_4: bool
+    padded: bool
+    stamp_order: Literal["little", "big"]
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"HW\d{4}FW\d{4}", self.version):

@@ -160,7 +160,8 @@ static inline const char *transcript_decode(struct transcript *transcript, const
             return "out of memory";
         memcpy(in, bytes + base, size);
         do {
-            violated = transcript_step(transcript, codec, &state, bytes, done, in + (done - base), fed - done, &taken);
+            const uint8_t *at = in + (done - base);
+            violated = transcript_step(transcript, codec, &state, bytes, done, at, fed - done, &taken);
             done += taken;
         } while (taken > 0 && done < fed && !violated);
         free(in);

@@ -252,7 +252,7 @@ static size_t entry_begin(const struct entry *entry, const uint8_t *bytes)
 }
 
 /*
- * Whether a message at bytes[at..end) could not be found: other messages, which damage or the data of frames made up,
+ * Whether a message at bytes[at..end) could not be found: other messages, made up by damage or by the data of frames,
  * hold all of it, or its beginning and then follow each other.
  */
 static bool hidden(const struct transcript *transcript, const uint8_t *bytes, size_t at, size_t end)
@@ -310,7 +310,8 @@ static void test_damage(void)
             for (size_t damages = 1 + random_below(&random, 5); damages > 0; damages--)
                 stream_damage(&stream, &random, filling);
             stream_finish(&stream);
-            const char *violated = transcript_decode(&transcript, codec, stream.bytes, stream.n, cuts_number((uint64_t)i));
+            uint64_t cuts = cuts_number((uint64_t)i);
+            const char *violated = transcript_decode(&transcript, codec, stream.bytes, stream.n, cuts);
             for (size_t at = 0; at < stream.n && !wrong; at++) {
                 if (!stream_expects(&stream, at))
                     continue;
@@ -388,7 +389,8 @@ static void test_round_trip(void)
             bytes[3] = (uint8_t)((bytes[3] & 0xF0) | 8);
         if (bytes[3] & 0x40)
             bytes[bytes[3] & 0x80 ? 7 : 5] &= bytes[3] & 0x80 ? 0xF8 : 0xE0;
-        if (taken != n || msg.kind != CODEC_FRAME || codec->encode(&frame, back) != n || memcmp(bytes, back, n) != 0) {
+        if (taken != n || msg.kind != CODEC_FRAME || codec->encode(&frame, back) != n ||
+            memcmp(bytes, back, n) != 0) {
             printf("no round trip: %d\n", i);
             wrong++;
         }

@@ -246,8 +246,9 @@ class HostProcess(Process):
 
     def user_signal(self, deadline_s: float = DEADLINE_S) -> None:
         """SIGUSR1; returns when it is sent."""
-        request = self.log.with_suffix(".usr1")
-        request.touch()
+        draft, request = self.log.with_suffix(".usr1-new"), self.log.with_suffix(".usr1")
+        draft.touch()  # making a file over 9p fails if the other side removes it in that moment
+        draft.rename(request)
         wait_until(lambda: not request.exists() or self.status is not None, "the host to signal", deadline_s)
 
     def stop(self, with_signal: int = signal.SIGTERM, deadline_s: float = DEADLINE_S) -> int:

@@ -17,7 +17,7 @@ from pathlib import Path
 import ftdi_vhci
 import pytest
 from ftdi_vhci import FakeFt245
-from rig import DEADLINE_S, Chip, Rig, wait_until
+from rig import DEADLINE_S, HOST, Chip, Rig, wait_until
 
 from bridged.errors import PortError
 from bridged.ports import Port, open_port
@@ -276,13 +276,13 @@ class TestHostSide:
         return rig.chip("ftdi0")
 
     def test_simulator_on_the_host(self, rig: Rig, in_our_machine: Chip) -> None:
+        (HOST / "state.json").unlink(missing_ok=True)
         simulator = rig.host_simulate("--state", "state.json", adapter="can232")
         port = open_port(str(in_our_machine.wait_tty()), 57600)
         exchange(port.fd, b"V\r", 0)
         assert exchange(port.fd, b"", 6).startswith(b"V1")
         port.close()
-        state = simulator.log.parent / "state.json"
         simulator.user_signal()
-        wait_until(state.exists, "the state that SIGUSR1 asks for")
+        wait_until((HOST / "state.json").exists, "the state that SIGUSR1 asks for")
         assert simulator.stop() == 0, str(simulator)
-        assert json.loads(state.read_text())
+        assert json.loads((HOST / "state.json").read_text())

@@ -274,6 +274,15 @@ def test_registers_after_power_on_and_written():
     assert device.violations == []
 
 
+def test_the_record_says_what_was_carried_out():
+    device = Usb2can()
+    ask(device, CONFIG + "0F100108" + "0F14020840" + "0F1503084000" + "0F16030801FF" + "0F2003084014" + GET)
+    assert device.record[1:] == [
+        "READ_REG 8", "WRITE_READ_REG 8 0x40", "BITMOD_REG 8 0x40 0x00", "BITMOD_READ_REG 8 0x01 0xFF",
+        "COMMAND 8 64 20", "COMMAND 128",
+    ]  # fmt: skip
+
+
 def test_a_register_that_does_not_take_the_value_answers_all_the_same():
     device = opened()
     assert hexed(device, reg(6, 0x00)) == "0F120106"

@@ -4,7 +4,7 @@ A simulated adapter must keep up with a real one; in the emulated machine it can
 
     N.argv          one argument per line, complete as soon as it has this name: simulate, usb2can, --line, …
     N.pid           it runs; what it writes is in N.out and N.err
-    N.stop, N.usr1  made by the guest: end it (SIGTERM); tell it SIGUSR1, and N.usr1 is removed
+    N.stop, N.usr1  renamed to that by the guest: end it (SIGTERM); tell it SIGUSR1, and N.usr1 is removed
     N.status        its exit status, once it has ended
 
 Nothing but `can-bridge simulate` is ever started. All end with us: at SIGTERM, and when our parent is gone.
