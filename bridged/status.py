@@ -2,7 +2,9 @@
 
 name, state, reason, adapter {type, port, version, serial_number}, bus {interface, channel, open},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
-from the adapter; tx_retries; tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
+from the adapter; tx_retries: frames sent once more; tx_returned: frames the adapter handed back; tx_stops,
+rx_overruns: how often it said "stop", "I lost frames"; tx_dropped, rx_dropped: {reason: frames}; …}, queued,
+uptime_s.
 At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_READ).
 """
 
@@ -151,7 +153,8 @@ def render(status: dict[str, Any]) -> str:
             f"{status['name']}: {status['state']}{reason}, up {status['uptime_s']:.0f} s",
             f"  adapter     {adapter['type']} on {adapter['port']}, {identity}",
             f"  bus         {bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
-            f"  to bus      {counters['rx_frames']} frames, {counters['rx_errors']} errors on the line",
+            f"  to bus      {counters['rx_frames']} frames, {counters['rx_errors']} errors on the line, "
+            f"{counters['rx_overruns']} overruns of the adapter",
             f"  dropped     {_reasons(counters['rx_dropped'])}",
             f"  to adapter  {counters['tx_frames']} frames, {counters['tx_retries']} retries, "
             f"{status['queued']} queued",
