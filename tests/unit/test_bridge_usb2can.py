@@ -298,7 +298,7 @@ def test_a_reset_behind_our_back_is_noticed_and_mended(
 
     def sending(state: State) -> Callable[[], bool]:
         def look() -> bool:
-            bench.send(Frame(next(numbers) & 0x7FF, False, False, 0, b""))
+            bench.send(*(Frame(n, True, False, 0, b"") for n in itertools.islice(numbers, 5)))
             return bridge.state is state
 
         return look

@@ -118,6 +118,7 @@ def test_the_device_does_the_same_however_the_bytes_are_cut(
         (OPEN, "0F400441246000", "WRITE_MESSAGE 41 24 60 00: the length does not fit the frame information"),
         (OPEN, "0F4003802460", "WRITE_MESSAGE 80 24 60: the length does not fit the frame information"),
         (OPEN, "0F400B0F2460" + "00" * 8, "WRITE_MESSAGE 0F 24 60 00 00 00 00 00 00 00 00: the length"),
+        (OPEN, "0F400C092460" + "00" * 9, "WRITE_MESSAGE 09 24 60 00 00 00 00 00 00 00 00 00: the length"),
         (CONFIG, "0F200140", "COMMAND 64: unknown"),
         (CONFIG, "0F200100", "COMMAND 0: 1 data bytes"),
         (CONFIG, "0F20020800", "COMMAND 8 0: 2 data bytes"),
