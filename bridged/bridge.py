@@ -23,6 +23,7 @@ from bridged.adapters.base import Answer, Exchange, Reply, Steps
 from bridged.buses import open_bus
 from bridged.errors import AdapterError, BusError, PortError, WrongDeviceError
 from bridged.lifecycle import Action, Backoff, Event, State, transition
+from bridged.polling import HealthPolling
 from bridged.ports import open_port
 from bridged.status import LOST_BEFORE_READ
 
@@ -40,7 +41,6 @@ RECONNECT_INITIAL_S = 0.1
 RECONNECT_MAXIMUM_S = 5.0
 FAULT_RETRY_S = 5.0
 BUS_RETRY_S = 1.0
-REFUSED_LOG_INTERVAL_S = 10.0
 ABORT_WAIT_S = 0.1
 
 REPLIES = {
@@ -83,9 +83,7 @@ class Bridge:
         self._steps: Steps | None = None
         self._tokens = itertools.count(1)
         self._pending: dict[int, Callable[[Answer], None]] = {}
-        self._refused_log_at = 0.0
-        self._report = ""  # the last in the log
-        self._report_log_at = 0.0
+        self._error_frames = Counter(error_frames=0, error_frames_lost=0)
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         sync = self.adapter.sync
@@ -97,6 +95,14 @@ class Bridge:
             answer_timeout=self.adapter.answer_timeout_s,
             sync=sync.request,
             sync_prefix=sync.prefix,
+        )
+        self._polling = HealthPolling(
+            self.adapter,
+            config.health.interval_s,
+            ask=self._ask,
+            tell=self._put_error_frame,
+            failed=lambda reason: self._dispatch(Event.SILENT, reason),
+            overruns=self._overruns,
         )
         self._thread = threading.Thread(target=self._relay.run, name="relay")
 
@@ -126,7 +132,9 @@ class Bridge:
             self._on_event(kind, token, text)
 
     def next_timer(self) -> float | None:
-        return min((t for t in (self._timer, self._bus_timer) if t is not None), default=None)
+        return min(
+            (t for t in (self._timer, self._bus_timer, self._polling.next_at) if t is not None), default=None
+        )
 
     def on_timer(self, now: float) -> None:
         if self._timer is not None and self._timer <= now:
@@ -135,6 +143,7 @@ class Bridge:
         if self._bus_timer is not None and self._bus_timer <= now:
             self._bus_timer = None
             self._open_bus()
+        self._polling.on_timer(now)
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""
@@ -147,10 +156,14 @@ class Bridge:
                 counters["rx_frames"] -= n
         queued = counters.pop("queued")
         identity = self.adapter.identity
+        health = self._polling.health
         return {
             "name": self.config.name,
             "state": self.state.value,
             "reason": "; ".join(filter(None, (self.reason, self._bus_reason))),
+            "bus_state": health.state.text if health.state is not None else None,
+            "tec": health.tec,
+            "rec": health.rec,
             "adapter": {
                 "type": self.config.adapter.type,
                 "port": self.config.adapter.port,
@@ -167,6 +180,9 @@ class Bridge:
                 "tx_frames": counters.pop("tx_frames"),
                 "rx_errors": counters.pop("skipped_messages"),
                 "tx_retries": counters.pop("tx_retries"),
+                "bus_off_restarts": health.restarts,
+                **health.happened,
+                **self._error_frames,
                 **counters,
             },
             "queued": queued,
@@ -212,6 +228,22 @@ class Bridge:
         self._lost_on_buses += self._lost_on_bus()
         self._bus.close()
         self._bus = None
+
+    def _overruns(self) -> int:
+        count = self._relay.counters()["rx_overruns"]
+        assert isinstance(count, int)
+        return count
+
+    def _put_error_frame(self, frame: bytes) -> None:
+        """What the bus of the adapter suffers, as a CAN error frame on ours."""
+        if not self.config.health.error_frames or self._bus is None:
+            return
+        try:
+            os.write(self._bus.fd, frame)
+        except OSError:  # down, full, or gone: the relay notices by itself
+            self._error_frames["error_frames_lost"] += 1
+        else:
+            self._error_frames["error_frames"] += 1
 
     # --- lifecycle ----------------------------------------------------------------------------
 
@@ -288,16 +320,19 @@ class Bridge:
         listen_only = self.config.channel.listen_only
         gate = _relay.GATE_LISTEN_ONLY if listen_only else _relay.GATE_OPEN
         self._relay.set_gates(receiving=True, transmit=gate)
+        self._polling.start(time.monotonic())
         identity = self.adapter.identity
         log.info("adapter version=%s serial_number=%s", identity.version, identity.serial_number)
 
     def _close_channel(self) -> None:
+        self._polling.stop()
         stopping = self.state is State.STOPPING
         gate = _relay.GATE_STOPPED if stopping else _relay.GATE_AWAY
         self._relay.set_gates(receiving=self._steps is None, transmit=gate)
         self._run_steps(self.adapter.close_steps())
 
     def _release(self) -> None:
+        self._polling.stop()
         self._steps = None
         self._pending.clear()
         self._relay.detach_port()
@@ -393,7 +428,7 @@ class Bridge:
         elif kind == _relay.EVENT_UNANSWERED:
             log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", token)
         elif kind == _relay.EVENT_FRAME_REFUSED:
-            self._on_frame_refused()
+            self._polling.frame_refused()
         elif kind == _relay.EVENT_STAMPED:
             self.adapter.saw_time_stamps()
         elif kind == _relay.EVENT_BUS_DOWN:
@@ -403,26 +438,4 @@ class Bridge:
         elif kind == _relay.EVENT_NOISE:
             self.adapter.saw_noise(text)
         else:
-            self._on_report(text)
-
-    def _on_report(self, text: bytes) -> None:
-        description = self.adapter.describe_report(text)
-        log.debug("adapter said %r unasked", text)
-        now = time.monotonic()
-        if description and (description != self._report or now >= self._report_log_at):
-            self._report, self._report_log_at = description, now + REFUSED_LOG_INTERVAL_S
-            log.warning("adapter reports: %s", description)
-
-    def _on_frame_refused(self) -> None:
-        """Asks why (manual 1.4: F after an error answer)."""
-        if self.state is State.RUNNING:
-            self._ask(self.adapter.status_request(), self._on_status)
-
-    def _on_status(self, answer: Answer) -> None:
-        if answer.reply is Reply.REFUSED:
-            self._dispatch(Event.SILENT, "the adapter's channel is closed: it was reset, or lost its power")
-            return
-        now = time.monotonic()
-        if now >= self._refused_log_at:
-            self._refused_log_at = now + REFUSED_LOG_INTERVAL_S
-            log.warning("adapter refuses frames; its status: %s", self.adapter.describe_status(answer))
+            self._polling.heard(text)

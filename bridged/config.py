@@ -61,6 +61,7 @@ InterfaceType = Annotated[
 InterfaceName = Annotated[str, Meta(min_length=1, description="the name of an interface")]
 QueueLength = Annotated[int, Meta(ge=1, le=65_536, description="a number of frames from 1 to 65536")]
 Window = Annotated[int, Meta(ge=1, le=32, description="a number of unanswered frames from 1 to 32")]
+Interval = Annotated[float, Meta(ge=0.1, le=0.5, description="a number of seconds from 0.1 to 0.5")]
 Deadline = Annotated[float, Meta(gt=0, le=3600, description="a number of seconds above 0 and up to 3600")]
 
 
@@ -152,6 +153,13 @@ class TransmitConfig(Struct, frozen=True, kw_only=True):
     deadline_s: float
 
 
+class HealthConfig(Struct, frozen=True, kw_only=True):
+    """How the adapter is watched: asked each `interval_s`; bus states as CAN error frames on the bus."""
+
+    interval_s: Interval = msgspec.field(default=0.25, name="interval")
+    error_frames: Flag = True
+
+
 class Config(Struct, frozen=True, kw_only=True):
     """One bridge. `name` is the stem of the file's name."""
 
@@ -161,6 +169,7 @@ class Config(Struct, frozen=True, kw_only=True):
     channel: ChannelConfig
     bus: BusConfig
     transmit: TransmitConfig
+    health: HealthConfig = HealthConfig()
 
 
 _SECTIONS: dict[str, type[Struct]] = {
@@ -169,6 +178,7 @@ _SECTIONS: dict[str, type[Struct]] = {
     "channel.acceptance": _AcceptanceKeys,
     "bus": _BusKeys,
     "transmit": _TransmitKeys,
+    "health": HealthConfig,
 }
 
 _ADAPTERS: dict[str, type[AdapterConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
@@ -233,9 +243,20 @@ def _read_file(path: Path, top: Section) -> Config | None:
         top.refuse_key(
             "transmit", "nothing is sent with channel.listen_only: true; remove this section, or listen_only"
         )
-    if top.problems or not (adapter and channel and bus and transmit):
+    health: HealthConfig | None = HealthConfig()
+    if "health" in top.nodes:
+        health = _read_plain(top.section("health", required=False), HealthConfig)
+    if top.problems or not (adapter and channel and bus and transmit and health):
         return None
-    return Config(name=path.stem, path=path, adapter=adapter, channel=channel, bus=bus, transmit=transmit)
+    return Config(
+        name=path.stem,
+        path=path,
+        adapter=adapter,
+        channel=channel,
+        bus=bus,
+        transmit=transmit,
+        health=health,
+    )
 
 
 _S = TypeVar("_S", bound=Struct)

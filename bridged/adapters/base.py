@@ -7,6 +7,8 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Protocol
 
+from bridged.health import Observation
+
 
 class Reply(enum.Enum):
     """How a device can answer."""
@@ -74,6 +76,7 @@ class Memory(Protocol):
 
 
 Steps = Generator[Exchange, Answer, None]
+HealthSteps = Generator[Exchange, Answer, Observation]
 
 
 class Adapter(Protocol):
@@ -97,11 +100,8 @@ class Adapter(Protocol):
     def close_steps(self) -> Steps:
         """From whatever state to a closed channel; the steps accept every answer."""
 
-    def status_request(self) -> Exchange:
-        """Asks what the device thinks of itself; describe_status explains the answer."""
-
-    def describe_status(self, answer: Answer) -> str:
-        """The status in words, for a log line."""
+    def health_steps(self) -> HealthSteps:
+        """Asks what the device thinks of its bus. AdapterError: it must be initialised again."""
 
     def saw_time_stamps(self) -> None:
         """Frames with time stamps came, which nobody asked for."""
@@ -109,5 +109,5 @@ class Adapter(Protocol):
     def saw_noise(self, noise: bytes) -> None:
         """Bytes that mean nothing came while the adapter is being initialised."""
 
-    def describe_report(self, text: bytes) -> str | None:
-        """What the device said unasked, for a log line; None if there is nothing to it."""
+    def read_report(self, text: bytes) -> Observation | None:
+        """What the device said unasked; None if there is nothing to it."""

@@ -6,8 +6,9 @@ import logging
 import re
 from typing import TYPE_CHECKING
 
-from bridged.adapters.base import Answer, Exchange, Flow, Identity, Memory, Polling, Reply, Steps
+from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Memory, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
+from bridged.health import BusState, Happened, Observation
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -40,6 +41,13 @@ STATUS_FLAGS = {
     5: "error passive",
     6: "arbitration lost",
     7: "bus error",
+}
+STATES = {2: BusState.ERROR_WARNING, 5: BusState.ERROR_PASSIVE}
+HAPPENED = {
+    0: Happened.RX_OVERFLOW,
+    3: Happened.RX_OVERFLOW,
+    6: Happened.ARBITRATION_LOST,
+    7: Happened.BUS_ERROR,
 }
 
 
@@ -211,15 +219,23 @@ class Can232:
 
     # --- health -------------------------------------------------------------------------------
 
-    def status_request(self) -> Exchange:
-        """`F`; reading clears the flags: they say what happened since the last time."""
-        return self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F")
-
-    def describe_status(self, answer: Answer) -> str:
+    def health_steps(self) -> HealthSteps:
+        """`F`; reading clears the flags: they say what happened since the last time, not what is."""
+        answer = yield self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F")
+        if answer.reply is REFUSED:
+            raise AdapterError("the adapter's channel is closed: it was reset, or lost its power")
         if not re.fullmatch(b"F[0-9A-Fa-f]{2}", answer.text):
-            return "unknown"
+            return Observation("unknown")
         flags = int(answer.text[1:], 16)
-        return ", ".join(text for bit, text in STATUS_FLAGS.items() if flags >> bit & 1) or "no flags"
+        happened = Happened.NOTHING
+        for bit, what in HAPPENED.items():
+            if flags >> bit & 1:
+                happened |= what
+        state = max(
+            (state for bit, state in STATES.items() if flags >> bit & 1), default=BusState.ERROR_ACTIVE
+        )
+        text = ", ".join(text for bit, text in STATUS_FLAGS.items() if flags >> bit & 1) or "no flags"
+        return Observation(text, state, lasting=False, happened=happened)
 
     def saw_time_stamps(self) -> None:
         if self._stamped:
@@ -231,5 +247,5 @@ class Can232:
     def saw_noise(self, noise: bytes) -> None:
         """A wrong baud rate is noticed by the answers that are missing."""
 
-    def describe_report(self, text: bytes) -> str | None:  # noqa: ARG002 - it never speaks unasked
+    def read_report(self, text: bytes) -> Observation | None:  # noqa: ARG002 - it never speaks unasked
         return None

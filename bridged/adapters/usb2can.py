@@ -7,8 +7,9 @@ import math
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from bridged.adapters.base import Answer, Exchange, Flow, Identity, Polling, Reply, Steps
+from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
+from bridged.health import BusState, Happened, Observation, state_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -23,13 +24,14 @@ START = 0x0F
 CONFIG_MODE, NORMAL_MODE, GET_MODE = 2, 3, 6
 BUS_OFF, ERROR, ERROR_STATUS = 8, 9, 1
 READ_REG, WRITE_REG, COMMAND, FW_VERSION = 16, 18, 32, 33
-CRITICAL_LIMIT, READY_LIMIT, GET = 0, 1, 128
+READ_TEC, READ_REC, READ_RST = 96, 97, 98
+CRITICAL_LIMIT, READY_LIMIT, ENABLE_READ_TEC, ENABLE_READ_REC, GET = 0, 1, 2, 3, 128
 BOOT, CONFIG, NORMAL = 0, 1, 2  # what GET_MODE tells
 MODE_NAMES = ("BOOT", "CONFIG", "NORMAL", "LOOPBACK")
 
 MOD, SR, IER, BTR0, BTR1, OCR, ACR0, AMR0, CDR = 0, 2, 4, 6, 7, 8, 16, 20, 31  # SJA1000, PeliCAN
 RESET_MODE, LISTEN_ONLY, SINGLE_FILTER = 0x01, 0x02, 0x08  # bits of MOD
-BUS_STATUS, ERROR_STATUS_BIT = 0x80, 0x40  # bits of SR
+BUS_STATUS = 0x80  # bit of SR
 
 CAPACITY = 18
 """Frames that the transmit buffer surely holds: the highest critical limit there is (COMMAND, 0)."""
@@ -43,6 +45,10 @@ FMS_SERIES, LOAD_SERIES = "7", "2"  # of the firmware: the y of HWxxxxFWyzzz
 
 TRIPLE = re.compile(rb"\x0f[^\xef]{1,64}\xef", re.DOTALL)
 """A message of CANLAB's Triple: the same start byte, but an end byte."""
+
+
+COUNTERS = bytes((START, COMMAND, 1, ENABLE_READ_TEC, START, COMMAND, 1, ENABLE_READ_REC))
+"""What lets READ_TEC and READ_REC be answered."""
 
 
 class Levels(NamedTuple):
@@ -81,6 +87,11 @@ class Usb2can:
         self._channel = channel
         self._noise = bytearray()
         self._levels_prefix: bytes | None = None  # how this firmware begins its answer to COMMAND GET
+        self._health: dict[int, Exchange] = {}  # what is asked to know how the bus is
+        self._restarts: bytes | None = None  # as READ_RST tells them: in which byte order is not said
+        self._status_exchange = _exchange(
+            message(READ_REG, SR), "tell its status register", bytes((READ_REG, 2, SR)), optional=True
+        )
         self.identity = Identity()
         self.flow: Flow | None = None
         # Mode NORMAL is part of the answer: after a reset the device would answer, but take no frames.
@@ -99,6 +110,7 @@ class Usb2can:
         levels = yield from self._set_limits()
         yield from self._enter_normal_mode()
         yield from self._start_controller()
+        yield from self._find_health()
         if levels:
             assert self._levels_prefix is not None
             ask, prefix = message(COMMAND, GET), self._levels_prefix
@@ -245,7 +257,7 @@ class Usb2can:
         before = yield from self._find_levels()
         if before is None or before.ready >= self._critical:
             limits = message(COMMAND, READY_LIMIT, 0) + limits  # 0 is below any critical limit
-        answer = yield self._in_config_mode(limits)
+        answer = yield self._in_config_mode(limits + COUNTERS)
         if answer.reply is NONE:
             msg = f"the adapter on {self._port} stopped answering when its limits were set"
             raise AdapterError(msg)
@@ -286,34 +298,48 @@ class Usb2can:
 
     # --- health -------------------------------------------------------------------------------
 
-    def status_request(self) -> Exchange:
-        """The SJA1000's status register."""
-        return _exchange(
-            message(READ_REG, SR), "tell its status register", bytes((READ_REG, 2, SR)), optional=True
+    def _find_health(self) -> Steps:
+        """Which of the questions about the bus this firmware answers."""
+        self._health = {}
+        for command in (READ_TEC, READ_REC, READ_RST):
+            prefix = bytes((command, 2 if command == READ_RST else 1))
+            exchange = _exchange(message(command), "tell its error counters", prefix, optional=True)
+            answer = yield exchange
+            if answer.reply is TEXT:
+                self._health[command] = exchange
+        self._restarts = answer.text[2:] if answer.reply is TEXT else None
+
+    def health_steps(self) -> HealthSteps:
+        """Error counters, restarts after bus-off, and from the SJA1000's status whether it is bus-off."""
+        answers = {}
+        for command, exchange in self._health.items():
+            answers[command] = (yield exchange).text[2:]
+        status = yield self._status_exchange
+        if status.reply is NONE or not all(answers.values()):
+            return Observation("unknown")
+        restarted = answers.get(READ_RST) != self._restarts
+        self._restarts = answers.get(READ_RST)
+        tec, rec = answers.get(READ_TEC), answers.get(READ_REC)
+        bus_off = bool(status.text[-1] & BUS_STATUS)
+        return _observation(
+            "bus-off" if bus_off else "bus good",
+            bus_off=bus_off,
+            tec=tec[0] if tec else None,
+            rec=rec[0] if rec else None,
+            happened=Happened.RESTARTED if restarted else Happened.NOTHING,
         )
 
-    def describe_status(self, answer: Answer) -> str:
-        if answer.reply is NONE:
-            return "unknown"
-        value = answer.text[-1]
-        if value & BUS_STATUS:
-            return "bus-off"
-        return (
-            "error counters above 95"
-            if value & ERROR_STATUS_BIT
-            else "no errors, its transmit buffer is full"
-        )
-
-    def describe_report(self, text: bytes) -> str | None:
+    def read_report(self, text: bytes) -> Observation | None:
         """BUS_OFF, ERROR STATUS, and a mode that a running device must not have."""
         if text[0] == BUS_OFF:
-            return f"bus-off, it restarts by itself ({_describe_registers(text[2:])})"
+            return _observation("bus-off, it restarts by itself", bus_off=True, tec=text[6], rec=text[5])
         if text[0] == ERROR and text[2] == ERROR_STATUS:
-            # Bytes 1 to 5 are those of BUS_OFF, so that SR, which is its byte 0 too, comes last.
-            registers = text[3:] if text[1] > 6 else text[-1:] + text[3:]
-            return f"error counters crossed the warning limit ({_describe_registers(registers)})"
+            # Bytes 1 to 5 are those of BUS_OFF, and in the same places.
+            shift = text[1] - 6  # all of BUS_OFF's bytes follow, where there is one more
+            crossed = "error counters crossed the warning limit"
+            return _observation(crossed, tec=text[6 + shift], rec=text[5 + shift])
         if text[0] == GET_MODE and self.flow and text[2] != NORMAL:
-            return f"mode {MODE_NAMES[text[2]]}: it was reset, or another program uses it"
+            return Observation(f"mode {MODE_NAMES[text[2]]}: it was reset, or another program uses it")
         return None
 
     def saw_time_stamps(self) -> None:
@@ -323,6 +349,17 @@ class Usb2can:
         self._noise += noise[: NOISE_KEPT - len(self._noise)]
 
 
-def _describe_registers(data: bytes) -> str:
-    """SR, ALC, ECC, REC, TEC, as BUS_OFF has them."""
-    return f"TEC={data[4]} REC={data[3]} SR={data[0]:#04x} ECC={data[2]:#04x}"
+def _observation(
+    text: str,
+    *,
+    bus_off: bool = False,
+    tec: int | None,
+    rec: int | None,
+    happened: Happened = Happened.NOTHING,
+) -> Observation:
+    counted = tec is not None and rec is not None
+    state = (
+        BusState.BUS_OFF if bus_off else state_of(tec, rec) if tec is not None and rec is not None else None
+    )
+    counters = f" (TEC={tec} REC={rec})" if counted else ""
+    return Observation(text + counters, state, tec=tec, rec=rec, happened=happened)

@@ -306,10 +306,9 @@ static void check_answers(struct relay *r, int64_t now)
     while (r->inflight_count && inflight_at(r, 0)->deadline_ns <= now) {
         enum inflight_kind kind = inflight_at(r, 0)->kind;
         bool frame = kind == INFLIGHT_FRAME || kind == INFLIGHT_LEVEL;
-        bool poll = kind == INFLIGHT_POLL;
         if (!frame) /* a frame keeps its place: its answer may only be late */
             inflight_give_up(r);
-        if (frame || r->gate == GATE_OPEN || (poll && r->gate == GATE_LISTEN_ONLY)) {
+        if (frame || r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY) {
             resync_start(r, now);
             return;
         }

@@ -167,6 +167,7 @@ _STEPS: dict[int, tuple[int, ...]] = {  # of chapter III; each ends before the n
     8: (LIMIT + CMD_CRITICAL, LIMIT + CMD_READY),
 }
 _STEP_OF = {item: step for step, items in _STEPS.items() for item in items}
+MODE_BITS = 0x0A  # of MOD: listen-only, single filter; they may be there already
 _WANTED = {MOD: 0x01, CDR: 0xC0, OCR: 0xDA, IER: 0x03}
 _NAMES = REGISTER_NAMES | {LIMIT + CMD_CRITICAL: "critical limit", LIMIT + CMD_READY: "ready limit"}
 
@@ -191,7 +192,8 @@ class Setup:
                 self._fault = f"{_NAMES[item]} (step {step}) after step {self._step}"
             else:
                 self._fault = self._missing(step)
-        if not self._fault and value != _WANTED.get(item, value):
+        compared = value & ~MODE_BITS if item == MOD else value
+        if not self._fault and compared != _WANTED.get(item, compared):
             self._fault = f"{_NAMES[item]} = 0x{value:02X}, not 0x{_WANTED[item]:02X} (step {step})"
         self._step = step
         self._done.add(item)

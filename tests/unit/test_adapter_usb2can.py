@@ -11,17 +11,17 @@ from usb2can_host import (
     assert_closed,
     assert_open,
     channel,
-    complaints,
     settings,
     started,
 )
 from usb2can_words import LOOPBACK, OPEN, SETUP, WRITTEN, ask, opened
 
 from bridged import _relay
-from bridged.adapters.base import Answer, Reply
-from bridged.adapters.usb2can import BUS_OFF, ERROR, GET_MODE, READ_REG, SR, Usb2can
+from bridged.adapters.base import Reply
+from bridged.adapters.usb2can import BUS_OFF, ERROR, GET_MODE, Usb2can
 from bridged.can import AcceptanceFilter, BitTiming, bit_timing
 from bridged.errors import AdapterError, WrongDeviceError
+from bridged.health import BusState, Happened, Observation
 from bridged.simulators.sja1000 import MOD, Frame
 from bridged.simulators.usb2can import Usb2can as Device
 
@@ -35,7 +35,7 @@ MANUAL_START = [
     "WRITE_REG 16 0x00", "WRITE_REG 17 0x00", "WRITE_REG 18 0x00", "WRITE_REG 19 0x00",
     "WRITE_REG 20 0xFF", "WRITE_REG 21 0xFF", "WRITE_REG 22 0xFF", "WRITE_REG 23 0xFF",
     "WRITE_REG 8 0xDA", "WRITE_REG 4 0x03", "WRITE_REG 6 0x03", "WRITE_REG 7 0x1C",
-    "COMMAND 0 15", "COMMAND 1 7", "NORMAL_MODE", "WRITE_REG 0 0x00",
+    "COMMAND 0 15", "COMMAND 1 7", "COMMAND 2", "COMMAND 3", "NORMAL_MODE", "WRITE_REG 0 0x00",
 ]  # fmt: skip
 MANUAL_END = ["CONFIG_MODE", "WRITE_REG 0 0x01"]
 
@@ -45,7 +45,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
     """Power has just come; at the end it has nothing to complain of."""
     made = Device(processing_s=request.param)
     yield made
-    assert complaints(made) == []
+    assert made.violations == []
 
 
 # --- what the manual says, literally ----------------------------------------------------------
@@ -360,14 +360,14 @@ def test_lost_answers_do_no_harm(listen_only: bool, count: int) -> None:
         assert_closed(device)
         host.start()
         assert_open(device, mod)
-        assert complaints(device) == []
+        assert device.violations == []
 
 
 def test_a_lost_answer_to_normal_mode_is_asked_for_again(device: Device) -> None:
     host = Host(device, adapter_for())
 
     def lose(_number: int) -> None:
-        if settings(device)[-1:] == ["COMMAND 1 7"] and device.record[-1] == "COMMAND 128":
+        if settings(device)[-1:] == ["COMMAND 3"] and device.record[-1] == "COMMAND 128":
             device.drop_answers = 1
 
     host.before_each = lose
@@ -443,36 +443,58 @@ def test_a_silent_device_is_not_waited_for() -> None:
 # --- words ------------------------------------------------------------------------------------
 
 
-def test_status() -> None:
-    adapter = adapter_for()
-    request = adapter.status_request()
-    assert (request.request, request.prefix) == (bytes.fromhex("0F 10 01 02"), bytes((READ_REG, 2, SR)))
+def looked(host: Host) -> Observation:
+    """What health_steps find out."""
+    steps = host.adapter.health_steps()
+    exchange = next(steps)
+    while True:
+        try:
+            exchange = steps.send(host.ask(exchange.request, exchange.prefix, exchange.timeout_s))
+        except StopIteration as end:
+            return end.value
 
-    def described(status: int) -> str:
-        return adapter.describe_status(Answer(Reply.TEXT, bytes((READ_REG, 2, SR, status))))
 
-    assert adapter.describe_status(Answer(Reply.NONE)) == "unknown"
-    assert described(0xC0) == "bus-off"
-    assert described(0x40) == "error counters above 95"
-    assert described(0x0C) == "no errors, its transmit buffer is full"
+def test_health(device: Device) -> None:
+    host = started(device)
+    assert looked(host) == Observation("bus good (TEC=0 REC=0)", BusState.ERROR_ACTIVE, tec=0, rec=0)
+    device.set_error_counters(host.now, 130, 4)
+    assert looked(host) == Observation("bus good (TEC=130 REC=4)", BusState.ERROR_PASSIVE, tec=130, rec=4)
+    device.set_error_counters(host.now, 0, 0)
+    device.set_bus_off(host.now, True)
+    seen = looked(host)
+    assert (seen.state, seen.happened) == (BusState.BUS_OFF, Happened.RESTARTED)
+    device.set_bus_off(host.now, False)
+    seen = looked(host)
+    assert (seen.state, seen.happened) == (BusState.ERROR_ACTIVE, Happened.NOTHING)
+
+
+def test_health_of_a_device_that_is_silent() -> None:
+    device = Device()
+    host = started(device)
+    device.silent = True
+    assert looked(host) == Observation("unknown")
 
 
 def test_reports() -> None:
     device = Device()
     adapter = started(device).adapter
-    describe = adapter.describe_report
+
+    def describe(text: bytes) -> str | None:
+        seen = adapter.read_report(text)
+        return seen and seen.description
+
     registers = bytes((0xC0, 1, 2, 0, 127))
     texts = [bytes((BUS_OFF, 5)) + registers, bytes((BUS_OFF, 6)) + registers + b"\xc0"]
     for text in texts:
-        assert describe(text) == "bus-off, it restarts by itself (TEC=127 REC=0 SR=0xc0 ECC=0x02)"
-    crossed = "error counters crossed the warning limit (TEC=96 REC=3 SR=0x40 ECC=0x19)"
+        assert describe(text) == "bus-off, it restarts by itself (TEC=127 REC=0)"
+    crossed = "error counters crossed the warning limit (TEC=96 REC=3)"
     assert describe(bytes((ERROR, 6, 1, 0, 0x19, 3, 96, 0x40))) == crossed
     assert describe(bytes((ERROR, 7, 1, 0x40, 0, 0x19, 3, 96, 0x40))) == crossed
     assert describe(bytes((GET_MODE, 1, 2))) is None
     assert describe(bytes((GET_MODE, 1, 0))) == "mode BOOT: it was reset, or another program uses it"
     assert describe(bytes((GET_MODE, 1, 3))) == "mode LOOPBACK: it was reset, or another program uses it"
     assert describe(bytes((0x12, 1, 0))) is None
-    assert adapter_for().describe_report(bytes((GET_MODE, 1, 0))) is None  # not running: nothing to it
+    assert adapter_for().read_report(bytes((GET_MODE, 1, 0))) is None  # not running: nothing to it
     assert device.violations == []
 
 
@@ -483,9 +505,11 @@ def test_what_the_device_reports_can_be_described() -> None:
     device.set_error_counters(1.0, 96, 3)
     device.set_bus_off(1.0, True)
     texts = [text for _, text, _ in _relay.decode("usb2can", [device.take_output(1.0)])]
-    assert [adapter.describe_report(text) for text in texts] == [
-        "error counters crossed the warning limit (TEC=96 REC=3 SR=0x4c ECC=0x19)",
-        "bus-off, it restarts by itself (TEC=127 REC=0 SR=0xcc ECC=0x19)",
+    assert [adapter.read_report(text) for text in texts] == [
+        Observation(
+            "error counters crossed the warning limit (TEC=96 REC=3)", BusState.ERROR_WARNING, tec=96, rec=3
+        ),
+        Observation("bus-off, it restarts by itself (TEC=127 REC=0)", BusState.BUS_OFF, tec=127, rec=0),
     ]
     assert device.violations == []
 

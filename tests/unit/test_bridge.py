@@ -320,17 +320,10 @@ def test_a_bug_in_the_bridge_still_ends_it_and_closes_the_channel(
     bench.plug_in(Can232(time.monotonic()))
     bridge = bench.bridge()
 
-    def bug(_answer: object) -> None:
+    def bug() -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(bridge, "_on_status", bug)
-    run = bridge._run
-
-    def run_into_it() -> None:
-        run()
-        bridge._on_frame_refused()
-
-    monkeypatch.setattr(bridge, "_run", run_into_it)
+    monkeypatch.setattr(bridge.adapter, "health_steps", bug)
     with pytest.raises(ZeroDivisionError):
         serve(bridge, None)
     while bench.device.state is not Channel.CLOSED:
@@ -340,13 +333,7 @@ def test_a_bug_in_the_bridge_still_ends_it_and_closes_the_channel(
 def test_an_adapter_that_was_reset_is_initialised_again(bench: Bench) -> None:
     bench.plug_in(Can232(time.monotonic()), faults=(Fault("reset", 0.5),))
     bridge = started(bench.bridge())
-
-    def sent() -> bool:
-        bench.bus.far.send(FRAME.pack(1, 0, b""))
-        time.sleep(0.01)
-        return bridge.state is State.CLOSING
-
-    run_until(bridge, sent)
+    run_until(bridge, lambda: bridge.state is State.CLOSING)
     assert "channel is closed" in bridge.reason
     run_until(bridge, lambda: bridge.state is State.RUNNING)
     stopped(bridge)

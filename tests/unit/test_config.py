@@ -432,14 +432,14 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "unknown": ("adapter:\n  type: can232\n  port: /dev/x\n  baud: 1\nchannel: {bitrate: 125000}\nbus: {channel: vcan0, loop: true}\ntransmitt: {}\n1: 2\n", [
         f"4:3: adapter.baud: unknown key, baudrate is probably meant; allowed here: {CAN232_KEYS}",
         f"6:23: bus.loop: unknown key; allowed here: {BUS_KEYS}",
-        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit",
-        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit",
+        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit, health",
+        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit, health",
     ]),
     "in the wrong section": ("adapter: {type: can232, port: /dev/x, bitrate: 1, channel: a}\nchannel: {bitrate: 125000, mask: 1}\nbus: {channel: vcan0}\nport: /dev/x\n", [
         f"1:39: adapter.bitrate: unknown key, it belongs to channel; allowed here: {CAN232_KEYS}",
         f"1:51: adapter.channel: unknown key, it belongs to bus; allowed here: {CAN232_KEYS}",
         f"2:28: channel.mask: unknown key, it belongs to channel.acceptance; allowed here: {CHANNEL_KEYS}",
-        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit",
+        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health",
     ]),
     "hyphen, capitals": (channel("bitrate: 125000, listen-only: true, BTR0: 3"), [
         f"2:28: channel.listen-only: unknown key, listen_only is probably meant; allowed here: {CHANNEL_KEYS}",
@@ -466,7 +466,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "in the wrong section, of usb2can": ("adapter: {type: usb2can, port: /dev/x, btr0: 1, ready: 2}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\nready_limit: 3\n", [
         f"1:40: adapter.btr0: unknown key, it belongs to channel; allowed here: {USB2CAN_KEYS}",
         f"1:49: adapter.ready: unknown key, ready_limit is probably meant; allowed here: {USB2CAN_KEYS}",
-        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit",
+        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health",
     ]),
     "of the other adapter": (adapter("ready_limit: 99, critical_limit: 15, critical_limit: ~"), [
         "1:39: adapter.ready_limit: goes with type: usb2can; remove it",

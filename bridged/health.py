@@ -1,0 +1,144 @@
+"""What an adapter's answers say about its CAN bus, and how SocketCAN programs are told: no I/O, no clock.
+
+A change of state becomes a CAN error frame as the kernel's drivers make them (linux/can/error.h and
+can_change_state in drivers/net/can/dev): error counters in data[6] and data[7], and the direction that the
+state comes from, if the counters are known.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from dataclasses import dataclass, field
+
+WARNING_LIMIT = 96
+PASSIVE_LIMIT = 128
+
+CLEAR_S = 1.0
+"""A device that only tells what happened is taken for error-active when nothing has happened for so long."""
+
+CAN_ERR_FLAG = 0x20000000
+CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x002, 0x004, 0x008
+CAN_ERR_BUSOFF, CAN_ERR_BUSERROR, CAN_ERR_RESTARTED, CAN_ERR_CNT = 0x040, 0x080, 0x100, 0x200
+CRTL_RX_OVERFLOW, CRTL_ACTIVE = 0x01, 0x40
+CRTL_RX_WARNING, CRTL_TX_WARNING, CRTL_RX_PASSIVE, CRTL_TX_PASSIVE = 0x04, 0x08, 0x10, 0x20
+
+_FRAME = struct.Struct("=IB3x8s")  # struct can_frame
+
+
+class BusState(enum.IntEnum):
+    """Of a CAN controller (ISO 11898-1); ordered."""
+
+    ERROR_ACTIVE = 0
+    ERROR_WARNING = 1
+    ERROR_PASSIVE = 2
+    BUS_OFF = 3
+
+    @property
+    def text(self) -> str:
+        return self.name.lower().replace("_", "-")
+
+
+class Happened(enum.Flag):
+    """What can have happened since the last look."""
+
+    NOTHING = 0
+    RX_OVERFLOW = enum.auto()
+    ARBITRATION_LOST = enum.auto()
+    BUS_ERROR = enum.auto()
+    RESTARTED = enum.auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What an adapter said of its bus. `state` None: it did not say; counters None: it cannot."""
+
+    description: str
+    state: BusState | None = None
+    lasting: bool = True  # False: `state` is the worst there was since the last look, not what is now
+    tec: int | None = None
+    rec: int | None = None
+    happened: Happened = Happened.NOTHING
+
+
+def state_of(tec: int, rec: int) -> BusState:
+    """The state that these error counters mean; bus-off cannot be told by them."""
+    worst = max(tec, rec)
+    if worst >= PASSIVE_LIMIT:
+        return BusState.ERROR_PASSIVE
+    return BusState.ERROR_WARNING if worst >= WARNING_LIMIT else BusState.ERROR_ACTIVE
+
+
+@dataclass
+class Health:
+    """The state of the bus, from all observations; None: not known."""
+
+    state: BusState | None = None
+    tec: int | None = None
+    rec: int | None = None
+    restarts: int = 0  # after bus-off
+    happened: dict[str, int] = field(default_factory=dict)
+    _seen_s: float = 0.0  # when `state` was seen last, where it is not lasting
+
+    def forget(self) -> None:
+        """The adapter is away: nothing is known."""
+        self.state = self.tec = self.rec = None
+
+    def observe(self, seen: Observation, now_s: float) -> list[bytes]:
+        """Take it in; the error frames (struct can_frame) that tell the bus what is new."""
+        frames = []
+        if seen.tec is not None:
+            self.tec, self.rec = seen.tec, seen.rec
+        for what in seen.happened:
+            name = str(what.name).lower()
+            self.happened[name] = self.happened.get(name, 0) + 1
+        if seen.happened & Happened.RESTARTED:
+            self.restarts += 1
+            frames.append(error_frame(CAN_ERR_RESTARTED))
+        if notice := _notice(seen.happened):
+            frames.append(notice)
+        if self._changed(seen, now_s):
+            frames.append(self._state_frame())
+        return frames
+
+    def _changed(self, seen: Observation, now_s: float) -> bool:
+        before, state = self.state, seen.state
+        if state is None:
+            return False
+        if not seen.lasting:
+            if before is not None and state < before and now_s - self._seen_s < CLEAR_S:
+                return False
+            self._seen_s = now_s
+        self.state = state
+        return state != (BusState.ERROR_ACTIVE if before is None else before)
+
+    def _state_frame(self) -> bytes:
+        """As can_change_state() fills it: both directions where it is not known which has the errors."""
+        state = self.state
+        if state is BusState.BUS_OFF:
+            return error_frame(CAN_ERR_BUSOFF)
+        tx, rx = {
+            BusState.ERROR_WARNING: (CRTL_TX_WARNING, CRTL_RX_WARNING),
+            BusState.ERROR_PASSIVE: (CRTL_TX_PASSIVE, CRTL_RX_PASSIVE),
+        }.get(state or BusState.ERROR_ACTIVE, (CRTL_ACTIVE, CRTL_ACTIVE))
+        if self.tec is None or self.rec is None:
+            return error_frame(CAN_ERR_CRTL, crtl=tx | rx)
+        crtl = (tx if self.tec >= self.rec else 0) | (rx if self.tec <= self.rec else 0)
+        return error_frame(CAN_ERR_CRTL | CAN_ERR_CNT, crtl=crtl, tec=self.tec, rec=self.rec)
+
+
+def _notice(happened: Happened) -> bytes | None:
+    classes = 0
+    crtl = 0
+    if happened & Happened.RX_OVERFLOW:
+        classes, crtl = CAN_ERR_CRTL, CRTL_RX_OVERFLOW
+    if happened & Happened.ARBITRATION_LOST:
+        classes |= CAN_ERR_LOSTARB
+    if happened & Happened.BUS_ERROR:
+        classes |= CAN_ERR_PROT | CAN_ERR_BUSERROR
+    return error_frame(classes, crtl=crtl) if classes else None
+
+
+def error_frame(classes: int, *, crtl: int = 0, tec: int = 0, rec: int = 0) -> bytes:
+    """A `struct can_frame` of these error classes (linux/can/error.h)."""
+    return _FRAME.pack(CAN_ERR_FLAG | classes, 8, bytes((0, crtl, 0, 0, 0, 0, tec, rec)))

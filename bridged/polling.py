@@ -1,0 +1,131 @@
+"""Asks the adapter of one bridge how its CAN bus is, and tells the log and the bus what is new."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from bridged.errors import AdapterError
+from bridged.health import BusState, Happened, Health, Observation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bridged.adapters.base import Adapter, Answer, Exchange, HealthSteps
+
+log = logging.getLogger(__name__)
+
+LOG_INTERVAL_S = 10.0
+
+
+class HealthPolling:
+    """One question at a time, the next one `interval_s` after the last answer.
+
+    `ask` sends an exchange and calls back with its answer; `tell` puts an error frame on the bus; `failed`
+    hears why the adapter must be initialised again; `overruns` is how often it has said that it lost frames.
+    The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
+    """
+
+    def __init__(
+        self,
+        adapter: Adapter,
+        interval_s: float,
+        *,
+        ask: Callable[[Exchange, Callable[[Answer], None]], None],
+        tell: Callable[[bytes], None],
+        failed: Callable[[str], None],
+        overruns: Callable[[], int],
+    ) -> None:
+        self.health = Health()
+        self.next_at: float | None = None
+        self._adapter = adapter
+        self._interval_s = interval_s
+        self._ask = ask
+        self._tell = tell
+        self._failed = failed
+        self._overruns = overruns
+        self._overruns_seen = 0
+        self._steps: HealthSteps | None = None
+        self._refused = False  # frames, since the last look
+        self._logged: dict[str, float] = {}  # what was in the log, and when
+
+    def start(self, now: float) -> None:
+        """The adapter runs."""
+        self._overruns_seen = self._overruns()
+        self.next_at = now
+
+    def stop(self) -> None:
+        """The adapter is no more: whatever it still answers is of no interest."""
+        self.next_at = None
+        self._steps = None
+        self._refused = False
+        self.health.forget()
+
+    def on_timer(self, now: float) -> None:
+        if self.next_at is not None and self.next_at <= now:
+            self._look()
+
+    def frame_refused(self) -> None:
+        """Asks why, at once (CAN232 manual 1.4: F after an error answer)."""
+        self._refused = True
+        if self.next_at is not None:
+            self._look()
+
+    def heard(self, text: bytes) -> None:
+        """What the adapter said unasked."""
+        seen = self._adapter.read_report(text)
+        log.debug("adapter said %r unasked", text)
+        running = self.next_at is not None or self._steps is not None
+        if seen is not None and running:
+            self._warn("adapter reports: %s", seen.description)
+            self._take(seen)
+
+    def _look(self) -> None:
+        self.next_at = None
+        self._steps = self._adapter.health_steps()
+        self._advance(None)
+
+    def _advance(self, answer: Answer | None) -> None:
+        if self._steps is None:
+            return
+        try:
+            exchange = self._steps.send(answer) if answer else next(self._steps)
+        except StopIteration as end:
+            self._steps = None
+            self.next_at = time.monotonic() + self._interval_s
+            self._looked(end.value)
+        except AdapterError as error:
+            self._steps = None
+            self._failed(str(error))
+        else:
+            self._ask(exchange, self._advance)
+
+    def _looked(self, seen: Observation) -> None:
+        if self._refused:
+            self._refused = False
+            self._warn("adapter refuses frames; its status: %s", seen.description)
+        self._take(seen)
+        overruns = self._overruns()
+        if overruns != self._overruns_seen:
+            self._overruns_seen = overruns
+            text = "the adapter lost received frames"
+            self._warn("%s: they were not fetched quickly enough", text)
+            self._take(Observation(text, happened=Happened.RX_OVERFLOW))
+
+    def _take(self, seen: Observation) -> None:
+        before = self.health.state
+        for frame in self.health.observe(seen, time.monotonic()):
+            self._tell(frame)
+        state = self.health.state
+        if state is not None and state != before and (before is not None or state != BusState.ERROR_ACTIVE):
+            level = logging.INFO if state == BusState.ERROR_ACTIVE else logging.WARNING
+            log.log(level, "bus_state=%s: %s", state.text, seen.description)
+
+    def _warn(self, pattern: str, text: str) -> None:
+        """Each text once in LOG_INTERVAL_S."""
+        now = time.monotonic()
+        if now - self._logged.get(pattern % text, -LOG_INTERVAL_S) >= LOG_INTERVAL_S:
+            self._logged = {known: at for known, at in self._logged.items() if now - at < LOG_INTERVAL_S}
+            self._logged[pattern % text] = now
+            log.warning(pattern, text)
