@@ -2,7 +2,8 @@
 
 A change of state becomes a CAN error frame as the kernel's drivers make them (linux/can/error.h and
 can_change_state in drivers/net/can/dev): error counters in data[6] and data[7], and the direction that the
-state comes from, if the counters are known.
+state comes from, if the counters are known. Without CAN_ERR_CNT, which says that there are counters: it is
+as new as Linux 6.0, and can-utils of before (Debian 12's) refuse to decode a frame that has it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ CLEAR_S = 1.0
 
 CAN_ERR_FLAG = 0x20000000
 CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x002, 0x004, 0x008
-CAN_ERR_BUSOFF, CAN_ERR_BUSERROR, CAN_ERR_RESTARTED, CAN_ERR_CNT = 0x040, 0x080, 0x100, 0x200
+CAN_ERR_BUSOFF, CAN_ERR_BUSERROR, CAN_ERR_RESTARTED = 0x040, 0x080, 0x100
 CRTL_RX_OVERFLOW, CRTL_ACTIVE = 0x01, 0x40
 CRTL_RX_WARNING, CRTL_TX_WARNING, CRTL_RX_PASSIVE, CRTL_TX_PASSIVE = 0x04, 0x08, 0x10, 0x20
 
@@ -124,7 +125,7 @@ class Health:
         if self.tec is None or self.rec is None:
             return error_frame(CAN_ERR_CRTL, crtl=tx | rx)
         crtl = (tx if self.tec >= self.rec else 0) | (rx if self.tec <= self.rec else 0)
-        return error_frame(CAN_ERR_CRTL | CAN_ERR_CNT, crtl=crtl, tec=self.tec, rec=self.rec)
+        return error_frame(CAN_ERR_CRTL, crtl=crtl, tec=self.tec, rec=self.rec)
 
 
 def _notice(happened: Happened) -> bytes | None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import time
-from typing import TYPE_CHECKING
+from collections import deque
+from typing import TYPE_CHECKING, Any
 
+from bridged.adapters.base import Reply
 from bridged.errors import AdapterError
 from bridged.health import BusState, Happened, Health, Observation
 
@@ -17,13 +20,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOG_INTERVAL_S = 10.0
+RATE_PERIOD_S = 1.0
+ANSWER_TIMES = 256
 
 
 class HealthPolling:
     """One question at a time, the next one `interval_s` after the last answer.
 
     `ask` sends an exchange and calls back with its answer; `tell` puts an error frame on the bus; `failed`
-    hears why the adapter must be initialised again; `overruns` is how often it has said that it lost frames.
+    hears why the adapter must be initialised again; `counters` are the relay's.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
@@ -35,7 +40,7 @@ class HealthPolling:
         ask: Callable[[Exchange, Callable[[Answer], None]], None],
         tell: Callable[[bytes], None],
         failed: Callable[[str], None],
-        overruns: Callable[[], int],
+        counters: Callable[[], dict[str, Any]],
     ) -> None:
         self.health = Health()
         self.next_at: float | None = None
@@ -44,15 +49,21 @@ class HealthPolling:
         self._ask = ask
         self._tell = tell
         self._failed = failed
-        self._overruns = overruns
+        self._counters = counters
         self._overruns_seen = 0
+        self._asked_at = 0.0
+        self._answer_times_s: deque[float] = deque(maxlen=ANSWER_TIMES)
+        self._samples: deque[tuple[float, int, int]] = (
+            deque()
+        )  # time, frames to the bus, frames to the adapter
         self._steps: HealthSteps | None = None
         self._refused = False  # frames, since the last look
+        self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
         self._logged: dict[str, float] = {}  # what was in the log, and when
 
     def start(self, now: float) -> None:
         """The adapter runs."""
-        self._overruns_seen = self._overruns()
+        self._overruns_seen = self._counters()["rx_overruns"]
         self.next_at = now
 
     def stop(self) -> None:
@@ -60,7 +71,24 @@ class HealthPolling:
         self.next_at = None
         self._steps = None
         self._refused = False
+        self._samples.clear()
         self.health.forget()
+
+    def answer_times_ms(self) -> dict[str, float] | None:
+        """How long the adapter took for its last answers."""
+        times = sorted(self._answer_times_s)
+        if not times:
+            return None
+        picked = {"min": times[0], "median": times[len(times) // 2], "max": times[-1]}
+        return {name: round(1000 * seconds, 3) for name, seconds in picked.items()}
+
+    def rates(self) -> dict[str, float]:
+        """Frames a second over the last RATE_PERIOD_S."""
+        rates = {"rx_fps": 0.0, "tx_fps": 0.0}
+        if len(self._samples) > 1:
+            (begin, rx, tx), (end, rx_end, tx_end) = self._samples[0], self._samples[-1]
+            rates = {"rx_fps": (rx_end - rx) / (end - begin), "tx_fps": (tx_end - tx) / (end - begin)}
+        return {name: round(rate, 1) for name, rate in rates.items()}
 
     def on_timer(self, now: float) -> None:
         if self.next_at is not None and self.next_at <= now:
@@ -79,16 +107,20 @@ class HealthPolling:
         running = self.next_at is not None or self._steps is not None
         if seen is not None and running:
             self._warn("adapter reports: %s", seen.description)
+            self._overtaken = self._overtaken or seen.state is not None
             self._take(seen)
 
     def _look(self) -> None:
         self.next_at = None
+        self._overtaken = False
         self._steps = self._adapter.health_steps()
         self._advance(None)
 
     def _advance(self, answer: Answer | None) -> None:
         if self._steps is None:
             return
+        if answer and answer.reply is not Reply.NONE:
+            self._answer_times_s.append(time.monotonic() - self._asked_at)
         try:
             exchange = self._steps.send(answer) if answer else next(self._steps)
         except StopIteration as end:
@@ -99,19 +131,29 @@ class HealthPolling:
             self._steps = None
             self._failed(str(error))
         else:
+            self._asked_at = time.monotonic()
             self._ask(exchange, self._advance)
 
     def _looked(self, seen: Observation) -> None:
         if self._refused:
             self._refused = False
             self._warn("adapter refuses frames; its status: %s", seen.description)
+        if self._overtaken:
+            seen = dataclasses.replace(seen, state=None, tec=None, rec=None)
         self._take(seen)
-        overruns = self._overruns()
+        counters = self._counters()
+        self._sample(time.monotonic(), counters["rx_frames"], counters["tx_frames"])
+        overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
             self._overruns_seen = overruns
             text = "the adapter lost received frames"
             self._warn("%s: they were not fetched quickly enough", text)
             self._take(Observation(text, happened=Happened.RX_OVERFLOW))
+
+    def _sample(self, now: float, rx_frames: int, tx_frames: int) -> None:
+        self._samples.append((now, rx_frames, tx_frames))
+        while len(self._samples) > 2 and now - self._samples[1][0] >= RATE_PERIOD_S:
+            self._samples.popleft()
 
     def _take(self, seen: Observation) -> None:
         before = self.health.state

@@ -1,10 +1,12 @@
 """The status of a running bridge over a local socket: one JSON object for each connection.
 
-name, state, reason, adapter {type, port, version, serial_number}, bus {interface, channel, open},
+name, state, reason, bus_state, tec, rec (None: not known), rates {rx_fps, tx_fps: frames a second},
+answer_time_ms {min, median, max: of the adapter's last answers to questions about its bus},
+adapter {type, port, version, serial_number}, bus {interface, channel, open},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
 from the adapter; tx_retries: frames sent once more; tx_returned: frames the adapter handed back; tx_stops,
-rx_overruns: how often it said "stop", "I lost frames"; tx_dropped, rx_dropped: {reason: frames}; …}, queued,
-uptime_s.
+rx_overruns: how often it said "stop", "I lost frames"; bus_off_restarts; error_frames: put on the bus;
+tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
 At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_READ).
 """
 
@@ -143,21 +145,32 @@ def _reasons(dropped: dict[str, int]) -> str:
     return ", ".join(f"{reason} {n}" for reason, n in dropped.items() if n) or "none"
 
 
+def _bus_state(status: dict[str, Any]) -> str:
+    counters = "" if status["tec"] is None else f", TEC {status['tec']}, REC {status['rec']}"
+    times = status["answer_time_ms"]
+    answers = f", answers in {times['median']:.1f} ms" if times else ""
+    return f"{status['bus_state'] or 'not known'}{counters}{answers}"
+
+
 def render(status: dict[str, Any]) -> str:
     """The status for a human."""
-    adapter, counters, bus = status["adapter"], status["counters"], status["bus"]
+    adapter, counters, bus, rates = status["adapter"], status["counters"], status["bus"], status["rates"]
     reason = f" ({status['reason']})" if status["reason"] else ""
     identity = f"version {adapter['version'] or '?'}, serial number {adapter['serial_number'] or '?'}"
-    return "\n".join(
-        [
-            f"{status['name']}: {status['state']}{reason}, up {status['uptime_s']:.0f} s",
-            f"  adapter     {adapter['type']} on {adapter['port']}, {identity}",
-            f"  bus         {bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
-            f"  to bus      {counters['rx_frames']} frames, {counters['rx_errors']} errors on the line, "
-            f"{counters['rx_overruns']} overruns of the adapter",
-            f"  dropped     {_reasons(counters['rx_dropped'])}",
-            f"  to adapter  {counters['tx_frames']} frames, {counters['tx_retries']} retries, "
-            f"{status['queued']} queued",
-            f"  dropped     {_reasons(counters['tx_dropped'])}",
-        ]
+    to_bus = (
+        f"{counters['rx_frames']} frames, {rates['rx_fps']:.0f}/s, "
+        f"{counters['rx_errors']} errors on the line, {counters['rx_overruns']} overruns of the adapter"
     )
+    to_adapter = (
+        f"{counters['tx_frames']} frames, {rates['tx_fps']:.0f}/s, {counters['tx_retries']} retries, "
+        f"{status['queued']} queued"
+    )
+    lines = {
+        "adapter": f"{adapter['type']} on {adapter['port']}, {identity}",
+        "CAN bus": _bus_state(status),
+        "interface": f"{bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
+        "to bus": f"{to_bus}\n  dropped     {_reasons(counters['rx_dropped'])}",
+        "to adapter": f"{to_adapter}\n  dropped     {_reasons(counters['tx_dropped'])}",
+    }
+    head = f"{status['name']}: {status['state']}{reason}, up {status['uptime_s']:.0f} s"
+    return "\n".join([head, *(f"  {name:<10}  {text}" for name, text in lines.items())])

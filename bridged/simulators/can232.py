@@ -18,9 +18,10 @@ import dataclasses
 import enum
 import math
 import re
-from collections import Counter, deque
+from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
+from bridged.simulators.can232_memory import Counters, Eeprom
 from bridged.simulators.sja1000 import Frame, accepts, bitrate, frame_bits
 from bridged.simulators.uart import Uart
 
@@ -57,39 +58,6 @@ class State(enum.Enum):
     CLOSED = "closed"
     OPEN = "open"
     LISTEN_ONLY = "listen-only"
-
-
-@dataclasses.dataclass
-class Eeprom:
-    """What survives power-off; `writes` counts every write of a cell, also of the value it had."""
-
-    auto_poll: bool = False  # X
-    time_stamps: bool = False  # Z
-    single_filter: bool = False  # W
-    uart: int = 2  # U, index into UART_RATES
-    auto_start: int = 0  # Q: 0 no, 1 normal, 2 listen-only
-    bitrate: float = 0.0  # bit/s, saved by Q as are the filters
-    code: str = "00000000"
-    mask: str = "FFFFFFFF"
-    writes: int = 0
-
-
-@dataclasses.dataclass
-class Counters:
-    """What happened since the simulator began; `frames_taken` = sent + discarded + still in the FIFO."""
-
-    commands: Counter[str] = dataclasses.field(default_factory=Counter)  # by letter, carried out or not
-    refused: int = 0  # commands answered BELL
-    refused_full: int = 0  # of these, frames for which the transmit FIFO had no room
-    answers_dropped: int = 0  # by a fault: carried out, but the host did not hear of it
-    frames_taken: int = 0  # from the host into the transmit FIFO
-    frames_sent: int = 0  # put on the bus
-    frames_discarded: int = 0  # in the transmit FIFO when the channel was closed
-    frames_received: int = 0  # from the bus into the receive FIFO
-    frames_lost: int = 0  # from the bus, receive FIFO full
-    frames_filtered: int = 0  # from the bus, not accepted
-    frames_unseen: int = 0  # on the bus while the channel was closed
-    rs232_lost: int = 0  # characters from the host that found no line buffer
 
 
 class Can232:
@@ -142,6 +110,7 @@ class Can232:
         self.code = bytes(4)
         self.mask = ACCEPT_ALL
         self.flags = 0
+        self._errors = 0  # the higher of the controller's error counters
         self._auto_started = bool(eeprom.auto_start)
         self._power_on = self._clock
         self._head_done = math.inf  # when the first frame of the transmit FIFO is on the bus
@@ -183,6 +152,14 @@ class Can232:
         if bus_off != self.bus_off:
             self.bus_off = bus_off
             self._start_sending(self._clock)
+
+    def set_error_counters(self, now: float, tec: int, rec: int) -> None:
+        """Errors on the bus: the flags tell of each limit that is crossed, either way (EI, EPI)."""
+        self.advance(now)
+        for limit, flag in ((96, ERROR_WARNING), (128, ERROR_PASSIVE)):
+            if (max(tec, rec) >= limit) != (self._errors >= limit):
+                self.flags |= flag
+        self._errors = max(tec, rec)
 
     def garbage(self, now: float, noise: bytes) -> None:
         """Noise on the line to the host."""

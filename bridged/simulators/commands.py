@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridged.errors import BridgeError, PortError
-from bridged.simulators.can232 import Can232, Eeprom
+from bridged.simulators.can232 import Can232
+from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.ends import open_can
 from bridged.simulators.serve import FAULTS, USB2CAN_FAULTS, Simulator, parse_fault
 from bridged.simulators.uart import Uart

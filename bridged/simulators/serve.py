@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-    from bridged.simulators.can232 import Eeprom
+    from bridged.simulators.can232_memory import Eeprom
     from bridged.simulators.uart import Uart
     from bridged.simulators.usb2can import Usb2can
 
@@ -41,7 +41,8 @@ TRAFFIC_BATCH = 32  # at most, a device has buffers for twice as many
 TRAFFIC_LATE_S = 0.05  # a bus does not catch up; it has been silent
 RECONNECT_S = 0.1
 
-FAULTS = ("silence", "garbage", "busoff", "refuse", "drop", "reset", "poweroff", "unplug")
+BUS_FAULTS = ("warning", "passive", "busoff")
+FAULTS = ("silence", "garbage", *BUS_FAULTS, "refuse", "drop", "reset", "poweroff", "unplug")
 USB2CAN_FAULTS = (*FAULTS, "lostgo", "value2", "overrun")
 
 
@@ -108,6 +109,7 @@ class Device(Protocol):
     def power_off(self, now: float) -> None: ...
     def power_cycle(self, now: float) -> None: ...
     def set_bus_off(self, now: float, bus_off: bool) -> None: ...
+    def set_error_counters(self, now: float, tec: int, rec: int) -> None: ...
     def garbage(self, now: float, noise: bytes) -> None: ...
     def host_writes(self, now: float, data: bytes) -> None: ...
     def bus_frame(self, now: float, frame: Frame) -> None: ...
@@ -381,6 +383,10 @@ class Simulator:
                 device.silent = True
             case "garbage":
                 self._repeat(self._make_noise, now + fault.duration_s, now)
+            case "warning":
+                device.set_error_counters(now, 100, 3)
+            case "passive":
+                device.set_error_counters(now, 130, 3)
             case "busoff":
                 device.set_bus_off(now, True)
             case "refuse":
@@ -404,6 +410,8 @@ class Simulator:
         match fault.kind:
             case "silence":
                 device.silent = False
+            case "warning" | "passive":
+                device.set_error_counters(now, 0, 0)
             case "busoff":
                 device.set_bus_off(now, False)
             case "refuse":

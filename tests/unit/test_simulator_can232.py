@@ -9,7 +9,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bridged.simulators.can232 import RECEIVE_FIFO, TRANSMIT_FIFO, Can232, Eeprom, State
+from bridged.simulators.can232 import RECEIVE_FIFO, TRANSMIT_FIFO, Can232, State
+from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.sja1000 import Frame, accepts, bitrate, frame_bits
 from bridged.simulators.uart import Uart
 

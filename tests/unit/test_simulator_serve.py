@@ -15,7 +15,8 @@ import pytest
 from simulating import TIMEOUT_S, ask, by_hand, host, process, read, running, until
 
 from bridged.errors import BusError, PortError
-from bridged.simulators.can232 import Can232, Eeprom
+from bridged.simulators.can232 import Can232
+from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.commands import load_eeprom
 from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
 from bridged.simulators.serve import Fault, Simulator, mixed_frames, parse_fault

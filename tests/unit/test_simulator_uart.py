@@ -4,7 +4,8 @@ import random
 
 import pytest
 
-from bridged.simulators.can232 import Can232, Eeprom
+from bridged.simulators.can232 import Can232
+from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.uart import Uart
 
 CHAR_S = 10 / 115_200

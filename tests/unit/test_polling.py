@@ -1,0 +1,107 @@
+"""Questions about the bus, one at a time, and what becomes of the answers."""
+
+from bridged.adapters.base import Answer, Exchange, HealthSteps, Reply
+from bridged.errors import AdapterError
+from bridged.health import BusState, Observation
+from bridged.polling import HealthPolling
+
+
+class Adapter:
+    """Answers nothing by itself: the test does."""
+
+    def __init__(self) -> None:
+        self.seen = Observation("good", BusState.ERROR_ACTIVE, tec=0, rec=0)
+        self.report: Observation | None = None
+        self.broken = False
+
+    def health_steps(self) -> HealthSteps:
+        for _ in range(2):
+            yield Exchange(b"?", "tell", (Reply.TEXT,))
+        if self.broken:
+            raise AdapterError("channel closed")
+        return self.seen
+
+    def read_report(self, _text: bytes) -> Observation | None:
+        return self.report
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.adapter = Adapter()
+        self.asked: list[object] = []
+        self.told: list[bytes] = []
+        self.failed: list[str] = []
+        self.counters = {"rx_overruns": 0, "rx_frames": 0, "tx_frames": 0}
+        self.polling = HealthPolling(
+            self.adapter,  # type: ignore[arg-type]
+            0.25,
+            ask=lambda _exchange, then: self.asked.append(then),
+            tell=self.told.append,
+            failed=self.failed.append,
+            counters=lambda: self.counters,
+        )
+        self.polling.start(0.0)
+        self.polling.on_timer(0.0)
+
+    def answer(self) -> None:
+        self.asked.pop(0)(Answer(Reply.TEXT))  # type: ignore[operator]
+
+
+def test_one_question_at_a_time_and_the_next_round_only_after_the_last_answer() -> None:
+    bench = Bench()
+    bench.polling.on_timer(1e9)
+    bench.polling.frame_refused()
+    assert len(bench.asked) == 1
+    bench.answer()
+    bench.polling.on_timer(1e9)
+    assert len(bench.asked) == 1
+    bench.answer()
+    assert bench.asked == []
+    assert bench.polling.health.state is BusState.ERROR_ACTIVE
+    bench.polling.on_timer(1e9)
+    assert len(bench.asked) == 1
+
+
+def test_answers_older_than_what_the_adapter_says_by_itself_are_not_believed() -> None:
+    bench = Bench()
+    bench.answer()
+    bench.adapter.report = Observation("passive", BusState.ERROR_PASSIVE, tec=130, rec=0)
+    bench.polling.heard(b"...")
+    bench.answer()
+    assert bench.polling.health.state is BusState.ERROR_PASSIVE
+    assert len(bench.told) == 1
+
+
+def test_a_frame_refused_between_two_rounds_is_explained_at_once() -> None:
+    bench = Bench()
+    bench.answer()
+    bench.answer()
+    bench.polling.frame_refused()
+    assert len(bench.asked) == 1
+
+
+def test_what_says_that_it_must_be_initialised_again() -> None:
+    bench = Bench()
+    bench.adapter.broken = True
+    bench.answer()
+    bench.answer()
+    assert bench.failed == ["channel closed"]
+    assert bench.polling.next_at is None
+
+
+def test_an_answer_after_the_end_means_nothing() -> None:
+    bench = Bench()
+    bench.polling.stop()
+    bench.answer()
+    assert (bench.asked, bench.polling.next_at, bench.polling.health.state) == ([], None, None)
+    bench.polling.heard(b"...")
+    assert bench.told == []
+
+
+def test_overruns_are_told_to_the_bus() -> None:
+    bench = Bench()
+    bench.counters["rx_overruns"] = 3
+    bench.answer()
+    bench.answer()
+    (frame,) = bench.told
+    assert frame[9] == 0x01  # CRTL_RX_OVERFLOW
