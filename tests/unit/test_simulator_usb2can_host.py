@@ -205,7 +205,7 @@ def test_the_steps_have_their_order(first: int):
         (reg(31, 0x80), "CDR = 0x80, not 0xC0 (step 3)"),
         (reg(8, 0x1A), "OCR = 0x1A, not 0xDA (step 5)"),
         (reg(4, 0xFF), "IER = 0xFF, not 0x03 (step 6)"),
-        (reg(0, 0x09), "MOD = 0x09, not 0x01 (step 2)"),
+        (reg(0, 0x05), "MOD = 0x05, not 0x01 (step 2)"),
     ],
 )
 def test_the_values_that_the_manual_gives_are_not_to_be_changed(wrong: str, words: str):
