@@ -20,6 +20,7 @@ EVENT_NOISE: Final[int]
 EVENT_FRAME_REFUSED: Final[int]
 EVENT_UNANSWERED: Final[int]
 EVENT_SILENT: Final[int]
+EVENT_STUCK: Final[int]
 EVENT_STAMPED: Final[int]
 EVENT_PORT_LOST: Final[int]
 EVENT_BUS_DOWN: Final[int]
@@ -52,6 +53,8 @@ class Relay:
     def turn(self, now: int, /) -> int | None:
         """One turn without waiting at the time `now` (ns); the time of the next one, None: on input."""
     def stop(self) -> None: ...
+    def wake(self) -> None:
+        """One turn, for nothing but to see that it turns (counter `turns`)."""
     def fileno(self) -> int:
         """Readable when events() has something."""
     def attach_port(self, fd: int | _HasFileno, /) -> None:

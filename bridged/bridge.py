@@ -8,28 +8,27 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import itertools
 import logging
 import os
 import queue
+import random
 import threading
 import time
-from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from bridged import _relay
 from bridged.adapters import make_adapter
-from bridged.adapters.base import Answer, Exchange, Reply, Steps
+from bridged.bus_end import BusEnd, repeated
 from bridged.buses import open_bus
-from bridged.errors import AdapterError, BusError, PortError, WrongDeviceError
-from bridged.lifecycle import Action, Backoff, Event, State, transition
+from bridged.errors import PortError
+from bridged.exchanges import REPLIES, Exchanges
+from bridged.lifecycle import Action, Backoff, Event, State, Told, transition
 from bridged.polling import HealthPolling
 from bridged.ports import open_port
+from bridged.ports.watch import Watch
 from bridged.status import LOST_BEFORE_READ
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from bridged.adapters.base import Memory
     from bridged.buses import Bus
     from bridged.config import Config
@@ -37,19 +36,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RECONNECT_INITIAL_S = 0.1
-RECONNECT_MAXIMUM_S = 5.0
-FAULT_RETRY_S = 5.0
-BUS_RETRY_S = 1.0
+UNANSWERED_LOG_S = 10.0
 ABORT_WAIT_S = 0.1
 
-REPLIES = {
-    _relay.EVENT_OK: Reply.OK,
-    _relay.EVENT_REFUSED: Reply.REFUSED,
-    _relay.EVENT_TEXT: Reply.TEXT,
-    _relay.EVENT_TIMEOUT: Reply.NONE,
-}
-ACCEPT = {Reply.OK: _relay.ACCEPT_OK, Reply.REFUSED: _relay.ACCEPT_REFUSED}
+# States that end at once when the device is plugged in; their reason is that of the failure before.
+LOOKING_OUT = frozenset({State.WAITING, State.BACKOFF, State.FAULT})
 
 
 def _reason(error: int) -> str:
@@ -69,23 +60,24 @@ class Bridge:
         self.config = config
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
-        self._told: set[str] = set()  # reasons in the log since it ran last
-        self._bus_reason = ""  # why the bus is not open
+        self._told = Told()
         self.finished = False
         self.adapter = make_adapter(config, memory)
         self._started = time.monotonic()
         self._port: Port | None = None
-        self._bus: Bus | None = None
         self._timer: float | None = None
-        self._bus_timer: float | None = None
-        self._lost_on_buses: Counter[str] = Counter()  # on buses that were closed since
-        self._backoff = Backoff(RECONNECT_INITIAL_S, RECONNECT_MAXIMUM_S)
-        self._steps: Steps | None = None
-        self._tokens = itertools.count(1)
-        self._pending: dict[int, Callable[[Answer], None]] = {}
-        self._error_frames = Counter(error_frames=0, error_frames_lost=0)
+        reconnect = config.reconnect
+        self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, random.random)
+        # A CAN232's own serial number is not that of a USB device.
+        usb = config.adapter.type == "usb2can"
+        self._watch = Watch(config.adapter.port, config.adapter.serial_number if usb else None)
+        self._path = config.adapter.port  # where it was last
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._opening = False  # a thread opens the port
+        self._discarded = 0
+        self._unanswered_log_at = 0.0
+        self._turns: object = None  # of the relay, when they were looked at last
         sync = self.adapter.sync
         self._relay = _relay.Relay(
             self.adapter.codec,
@@ -96,30 +88,37 @@ class Bridge:
             sync=sync.request,
             sync_prefix=sync.prefix,
         )
+        self._bus_end = BusEnd(config, self._relay, self._open_bus)
+        self._exchanges = Exchanges(self._relay, self._dispatch)
         self._polling = HealthPolling(
             self.adapter,
             config.health.interval_s,
-            ask=self._ask,
-            tell=self._put_error_frame,
+            ask=self._exchanges.ask,
+            tell=self._bus_end.put_error_frame,
             failed=lambda reason: self._dispatch(Event.SILENT, reason),
-            overruns=self._overruns,
+            counters=self._relay.counters,
         )
         self._thread = threading.Thread(target=self._relay.run, name="relay")
 
     # --- for the owner ------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Starts the relay; the adapter follows when the bus is open."""
+    def start(self, bus: Bus | None = None) -> None:
+        """Starts the relay; the adapter follows when the bus is open. `bus`: of a bridge that ended."""
         self._thread.start()
-        self._open_bus()
+        if bus is None:
+            self._bus_end.open()
+        else:
+            self._bus_end.use(bus)
+        self._start_with_bus()
 
     def stop(self) -> None:
         """Closes the adapter, then everything; `finished` says when."""
-        self._bus_timer = None
+        self._bus_end.next_at = None
         self._dispatch(Event.STOP)
 
-    def filenos(self) -> tuple[int, int]:
-        return self._relay.fileno(), self._opened_fd
+    def filenos(self) -> tuple[int, ...]:
+        watch = (self._watch.fd,) if self._watch.fd >= 0 else ()
+        return self._relay.fileno(), self._opened_fd, *watch
 
     def on_readable(self) -> None:
         try:
@@ -130,25 +129,37 @@ class Bridge:
             self._on_opened()
         for kind, token, text in self._relay.events():
             self._on_event(kind, token, text)
+        if self.state in LOOKING_OUT and self._watch.has_come():
+            log.info("%s was plugged in", self.config.adapter.port)
+            self._dispatch(Event.APPEARED)
 
     def next_timer(self) -> float | None:
-        return min(
-            (t for t in (self._timer, self._bus_timer, self._polling.next_at) if t is not None), default=None
-        )
+        timers = (self._timer, self._bus_end.next_at, self._polling.next_at)
+        return min((t for t in timers if t is not None), default=None)
 
     def on_timer(self, now: float) -> None:
         if self._timer is not None and self._timer <= now:
             self._timer = None
             self._dispatch(Event.TIMER)
-        if self._bus_timer is not None and self._bus_timer <= now:
-            self._bus_timer = None
-            self._open_bus()
+        self._bus_end.on_timer(now)
+        self._start_with_bus()
         self._polling.on_timer(now)
+
+    def has_turned(self) -> bool:
+        """Whether the relay has turned since the last call, which gave it cause to; waits if a turn hangs."""
+        turns, self._turns = self._turns, self._relay.counters()["turns"]
+        self._relay.wake()
+        return turns != self._turns
+
+    def condition(self) -> tuple[State, str, bool]:
+        """The state, the reason why it is not running, whether the bus is open."""
+        reason = "; ".join(filter(None, (self.reason, self._bus_end.reason)))
+        return self.state, reason, self._bus_end.bus is not None
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""
         counters: dict[str, Any] = self._relay.counters()
-        for reason, n in (self._lost_on_buses + self._lost_on_bus()).items():
+        for reason, n in self._bus_end.lost_frames().items():
             if reason in LOST_BEFORE_READ:
                 counters["tx_dropped"][reason] = n
             else:  # the relay took it for delivered
@@ -160,10 +171,12 @@ class Bridge:
         return {
             "name": self.config.name,
             "state": self.state.value,
-            "reason": "; ".join(filter(None, (self.reason, self._bus_reason))),
+            "reason": self.condition()[1],
             "bus_state": health.state.text if health.state is not None else None,
             "tec": health.tec,
             "rec": health.rec,
+            "rates": self._polling.rates(),
+            "answer_time_ms": self._polling.answer_times_ms(),
             "adapter": {
                 "type": self.config.adapter.type,
                 "port": self.config.adapter.port,
@@ -173,7 +186,7 @@ class Bridge:
             "bus": {
                 "interface": self.config.bus.interface,
                 "channel": self.config.bus.channel,
-                "open": self._bus is not None,
+                "open": self._bus_end.bus is not None,
             },
             "counters": {
                 "rx_frames": counters.pop("rx_frames"),
@@ -182,68 +195,21 @@ class Bridge:
                 "tx_retries": counters.pop("tx_retries"),
                 "bus_off_restarts": health.restarts,
                 **health.happened,
-                **self._error_frames,
+                **self._bus_end.error_frames,
+                "tx_discarded": self._discarded,
                 **counters,
             },
             "queued": queued,
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
 
-    # --- the bus ------------------------------------------------------------------------------
-
-    def _open_bus(self) -> None:
+    def _open_bus(self) -> Bus:
         bus = self.config.bus
-        try:
-            self._bus = open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options)
-        except BusError as error:
-            if self._bus_reason != str(error):
-                log.error("bus not open: %s; trying again every %g s", error, BUS_RETRY_S)
-            self._bus_reason = str(error)
-            self._bus_timer = time.monotonic() + BUS_RETRY_S
-            return
-        self._bus_reason = ""
-        if self._bus.warning:
-            log.warning("%s", self._bus.warning)
-        log.info("bus open: %s", self._bus.description)
-        self._relay.attach_bus(self._bus.fd)
-        if self.state is State.IDLE:
+        return open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options)
+
+    def _start_with_bus(self) -> None:
+        if self.state is State.IDLE and self._bus_end.bus is not None:
             self._dispatch(Event.START)
-
-    def _on_bus_lost(self, error: int) -> None:
-        if self._bus is None:
-            return
-        log.error(
-            "bus lost: %s: %s; opening it again", self._bus.description, self._bus.failure or _reason(error)
-        )
-        self._close_bus()
-        self._bus_timer = time.monotonic()
-
-    def _lost_on_bus(self) -> Counter[str]:
-        return Counter(self._bus.dropped() if self._bus else {})
-
-    def _close_bus(self) -> None:
-        if self._bus is None:
-            return
-        self._relay.detach_bus()
-        self._lost_on_buses += self._lost_on_bus()
-        self._bus.close()
-        self._bus = None
-
-    def _overruns(self) -> int:
-        count = self._relay.counters()["rx_overruns"]
-        assert isinstance(count, int)
-        return count
-
-    def _put_error_frame(self, frame: bytes) -> None:
-        """What the bus of the adapter suffers, as a CAN error frame on ours."""
-        if not self.config.health.error_frames or self._bus is None:
-            return
-        try:
-            os.write(self._bus.fd, frame)
-        except OSError:  # down, full, or gone: the relay notices by itself
-            self._error_frames["error_frames_lost"] += 1
-        else:
-            self._error_frames["error_frames"] += 1
 
     # --- lifecycle ----------------------------------------------------------------------------
 
@@ -256,24 +222,31 @@ class Bridge:
             self._perform(action)
 
     def _log_transition(self, reason: str) -> None:
-        """Each cause once: retries that fail for the same one are not told again until it runs."""
-        self.reason = reason or (self.reason if self.state in {State.BACKOFF, State.FAULT} else "")
+        """One line; retries, and what is repeated too often, for those who look for a fault only."""
+        self.reason = reason or (self.reason if self.state in LOOKING_OUT else "")
+        times = self._told.tell(reason, time.monotonic()) if reason else None
+        if times is not None:
+            log.warning("state=%s: %s%s", self.state.value, reason, repeated(times))
+            return
+        quiet = self._told.quiet if self.state is State.RUNNING else self._told.failing
+        ending = self.state in {State.STOPPING, State.STOPPED}
+        level = logging.DEBUG if quiet and not ending else logging.INFO
+        log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
         if self.state is State.RUNNING:
-            self._told.clear()
-        if reason and reason not in self._told:
-            log.warning("state=%s: %s", self.state.value, reason)
-            self._told.add(reason)
-        else:
-            level = logging.DEBUG if self._told else logging.INFO
-            log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
+            self._told.well()
 
     def _perform(self, action: Action) -> None:
         match action:
+            case Action.LOOK:
+                self._look()
             case Action.OPEN:
+                self._timer = None
+                self._watch.disarm()
+                self._opening = True
                 threading.Thread(target=self._open_port, name="open", daemon=True).start()
             case Action.INITIALISE:
                 assert self._port is not None
-                self._run_steps(self.adapter.init_steps(self._port.serial_number))
+                self._exchanges.run(self.adapter.init_steps(self._port.serial_number), Event.READY)
             case Action.RUN:
                 self._run()
             case Action.CLOSE:
@@ -281,16 +254,32 @@ class Bridge:
             case Action.RELEASE:
                 self._release()
             case Action.WAIT:
-                self._timer = time.monotonic() + self._backoff.next_s()
+                self._wait(self._backoff.next_s(time.monotonic()))
             case Action.WAIT_LONG:
-                self._timer = time.monotonic() + FAULT_RETRY_S
+                self._wait(self._backoff.longest_s())
+            case Action.HURRY:
+                self._backoff.hurry()
             case Action.FINISH:
                 self._finish()
+
+    def _wait(self, seconds: float) -> None:
+        self._watch.arm()
+        self._timer = time.monotonic() + seconds
+
+    def _look(self) -> None:
+        """Looks again now and then: what is no device of the kernel's (a pty) comes without an event."""
+        self._wait(self._backoff.next_s(time.monotonic()))
+        if self._watch.is_there():
+            self._dispatch(Event.APPEARED)
 
     def _open_port(self) -> None:
         result: Port | Exception
         try:
-            result = open_port(self.config.adapter.port, self.adapter.baudrate)
+            path = self._watch.path()
+            if path not in {self._path, self.config.adapter.port}:
+                log.info("%s has the serial number that is wanted, not %s", path, self.config.adapter.port)
+            self._path = path
+            result = open_port(path, self.adapter.baudrate)
         except Exception as error:  # noqa: BLE001 - a bug is raised again in the thread that can end the bridge
             result = error
         self._opened.put(result)
@@ -298,8 +287,12 @@ class Bridge:
 
     def _on_opened(self) -> None:
         result = self._opened.get_nowait()
+        self._opening = False
         if isinstance(result, PortError):
-            self._dispatch(Event.OPEN_FAILED, str(result))
+            if not self.finished:
+                self._watch.arm()  # before the look, or it might come between
+            event = Event.OPEN_FAILED if self._watch.is_there() else Event.ABSENT
+            self._dispatch(event, str(result))
             return
         if isinstance(result, Exception):
             raise result
@@ -308,7 +301,7 @@ class Bridge:
         self._dispatch(Event.OPENED)
 
     def _run(self) -> None:
-        self._backoff.reset()
+        self._backoff.runs(time.monotonic())
         if self.adapter.polling is not None:
             polling = self.adapter.polling
             self._relay.set_polling(polling.request, polling.prefix, polling.interval_s)
@@ -328,13 +321,12 @@ class Bridge:
         self._polling.stop()
         stopping = self.state is State.STOPPING
         gate = _relay.GATE_STOPPED if stopping else _relay.GATE_AWAY
-        self._relay.set_gates(receiving=self._steps is None, transmit=gate)
-        self._run_steps(self.adapter.close_steps())
+        self._relay.set_gates(receiving=not self._exchanges.running, transmit=gate)
+        self._exchanges.run(self.adapter.close_steps(), Event.CLOSED)
 
     def _release(self) -> None:
         self._polling.stop()
-        self._steps = None
-        self._pending.clear()
+        self._exchanges.forget()
         self._relay.detach_port()
         for kind, token, text in self._relay.events():  # of the port that is no more, or of the bus
             if kind in {_relay.EVENT_BUS_LOST, _relay.EVENT_BUS_DOWN}:
@@ -345,6 +337,7 @@ class Bridge:
 
     def _finish(self) -> None:
         self._timer = None
+        self._watch.disarm()
         self._relay.set_gates(receiving=False, transmit=_relay.GATE_STOPPED)
         self._relay.stop()
         self._thread.join()
@@ -364,60 +357,30 @@ class Bridge:
             self._port = None
         self.finished = True
 
+    @property
+    def settled(self) -> bool:
+        """`finished`, and no port is being opened any more that would be in a successor's way."""
+        return self.finished and not self._opening
+
+    def hand_over_bus(self) -> Bus | None:
+        """After `finished`: the open bus, for a successor's start(); None: it was lost."""
+        if any(kind == _relay.EVENT_BUS_LOST for kind, _, _ in self._relay.events()):
+            return None
+        return self._bus_end.hand_over()
+
     def close(self) -> None:
-        """After `finished`: gives the bus back."""
-        self._close_bus()
-
-    # --- exchanges ----------------------------------------------------------------------------
-
-    def _ask(self, exchange: Exchange, then: Callable[[Answer], None]) -> None:
-        token = next(self._tokens) & 0xFFFFFFFF
-        self._pending[token] = then
-        replies = exchange.accept + exchange.reject
-        accept = sum(ACCEPT.get(reply, 0) for reply in set(replies))
-        self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s)
-
-    def _run_steps(self, steps: Steps) -> None:
-        """Performs them one after the other; a step that was under way is forgotten, its answer awaited."""
-        self._pending.clear()
-        self._steps = steps
-        self._advance(None)
-
-    def _advance(self, answer: Answer | None) -> None:
-        steps = self._steps
-        assert steps is not None
-        try:
-            exchange = steps.send(answer) if answer else next(steps)
-        except StopIteration:
-            self._steps = None
-            self._dispatch(Event.READY if self.state is State.INITIALISING else Event.CLOSED)
-        except WrongDeviceError as error:
-            self._dispatch(Event.REFUSED, str(error))
-        except AdapterError as error:
-            self._dispatch(Event.UNANSWERED, str(error))
-        else:
-            self._ask(exchange, lambda reply: self._on_step_answer(exchange, reply))
-
-    def _on_step_answer(self, exchange: Exchange, answer: Answer) -> None:
-        if answer.reply in exchange.accept:
-            self._advance(answer)
-            return
-        advice = f": {exchange.advice}" if exchange.advice else ""
-        if answer.reply is Reply.REFUSED:
-            self._dispatch(Event.REFUSED, f"the adapter refused to {exchange.purpose}{advice}")
-        else:
-            wait = f"within {exchange.timeout_s:.2g} s"
-            self._dispatch(
-                Event.UNANSWERED, f"the adapter did not answer the request to {exchange.purpose} {wait}"
-            )
+        """After `finished`, or instead of start(): gives back what it holds."""
+        self._bus_end.close()
+        self._watch.close()
+        if not self._opening and self._opened_fd >= 0:
+            os.close(self._opened_fd)
+            self._opened_fd = -1
 
     # --- events of the relay ------------------------------------------------------------------
 
     def _on_event(self, kind: int, token: int, text: bytes) -> None:
         if kind in REPLIES:
-            then = self._pending.pop(token, None)
-            if then is not None:
-                then(Answer(REPLIES[kind], text))
+            self._exchanges.answer(kind, token, text)
         elif kind == _relay.EVENT_PORT_LOST:
             failure = self._port.failure if self._port else None
             self._dispatch(
@@ -426,16 +389,35 @@ class Bridge:
         elif kind == _relay.EVENT_SILENT:
             self._dispatch(Event.SILENT, "the adapter stopped answering")
         elif kind == _relay.EVENT_UNANSWERED:
-            log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", token)
+            self._on_unanswered(token)
+        elif kind == _relay.EVENT_STUCK:
+            self._on_stuck(token)
         elif kind == _relay.EVENT_FRAME_REFUSED:
             self._polling.frame_refused()
         elif kind == _relay.EVENT_STAMPED:
             self.adapter.saw_time_stamps()
         elif kind == _relay.EVENT_BUS_DOWN:
-            log.warning("interface %s is down", self.config.bus.channel)
+            self._bus_end.on_down()
         elif kind == _relay.EVENT_BUS_LOST:
-            self._on_bus_lost(token)
+            self._bus_end.on_lost(token)
         elif kind == _relay.EVENT_NOISE:
             self.adapter.saw_noise(text)
         else:
             self._polling.heard(text)
+
+    def _on_unanswered(self, resyncs: int) -> None:
+        now = time.monotonic()
+        if now >= self._unanswered_log_at:
+            self._unanswered_log_at = now + UNANSWERED_LOG_S
+            log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", resyncs)
+
+    def _on_stuck(self, frames: int) -> None:
+        """What waits in the adapter's own buffer would be sent whenever the bus lets it, however old."""
+        if self.state is not State.RUNNING:
+            return
+        self._discarded += frames
+        reason = (
+            f"no frame has left the adapter for {self.config.transmit.deadline_s:g} s (is another node on "
+            f"the bus, to acknowledge them?): those in its buffer are thrown away, so that none is sent late"
+        )
+        self._dispatch(Event.SILENT, reason)

@@ -6,8 +6,8 @@ import argparse
 import json
 import logging
 import os
-import select
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from bridged.config import Config
 
 EX_CONFIG = 78  # sysexits.h
+WATCH_INTERVAL_S = 1.0
 EXIT_NOT_RUNNING = 3  # as systemctl status
 CONFIG_DIRECTORY = Path("/etc/can-bridge")
 
@@ -39,52 +40,33 @@ def _load(name: str) -> Config:
 
 def _run(args: argparse.Namespace) -> int:
     from bridged.bridge import Bridge  # noqa: PLC0415
+    from bridged.journal import start_logging  # noqa: PLC0415
     from bridged.memory import FileMemory, state_directory  # noqa: PLC0415
-    from bridged.service import serve  # noqa: PLC0415
+    from bridged.notify import systemd_notifier  # noqa: PLC0415
+    from bridged.service import Service, hangup_means_reload  # noqa: PLC0415
     from bridged.status import StatusServer, render, socket_path  # noqa: PLC0415
 
     config = _load(args.config)
-    _log_to_stderr(config.name, verbose=args.verbose)
-    bridge = Bridge(config, FileMemory(state_directory()))
-    status = StatusServer(args.socket or socket_path(config.name), bridge.snapshot)
+    notifier = systemd_notifier()
+    fields = start_logging(config.name, verbose=args.verbose)
+    memory = FileMemory(state_directory())
+
+    def successor(present: Config) -> Bridge | None:
+        fresh = _load(args.config)
+        return None if fresh == present else Bridge(fresh, memory)
+
+    def snapshot() -> dict[str, Any]:
+        return service.bridge.snapshot()  # of the present one
+
+    service = Service(Bridge(config, memory), notifier, successor if hangup_means_reload() else None)
+    fields.state = lambda: service.bridge.state.value
+    status = StatusServer(args.socket or socket_path(config.name), snapshot)
     try:
-        serve(bridge, status)
+        service.run(status)
     finally:
         status.close()
-    logging.getLogger(__name__).info("%s", render(bridge.snapshot()).replace("\n ", ";"))
+    logging.getLogger(__name__).info("%s", render(snapshot()).replace("\n ", ";"))
     return 0
-
-
-class _StderrHandler(logging.StreamHandler[Any]):
-    """Never waits for a reader: a full pipe must not stop the bridge. What it could not say it counts."""
-
-    lost = 0
-
-    def emit(self, record: logging.LogRecord) -> None:
-        poll = select.poll()
-        try:
-            poll.register(self.stream, select.POLLOUT)
-            writable = poll.poll(0)
-        except (OSError, ValueError):  # closed
-            return
-        if not writable:
-            self.lost += 1
-            return
-        if self.lost:
-            record.msg, record.args = f"{record.getMessage()} ({self.lost} lines before this are lost)", ()
-            self.lost = 0
-        super().emit(record)
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        """Nobody is left to be told."""
-
-
-def _log_to_stderr(name: str, *, verbose: bool) -> None:
-    logging.basicConfig(
-        format=f"%(asctime)s %(levelname)-7s {name}: %(message)s",
-        level=logging.DEBUG if verbose else logging.INFO,
-        handlers=[_StderrHandler()],
-    )
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -119,8 +101,15 @@ def _status_path(args: argparse.Namespace) -> Path:
 def _status(args: argparse.Namespace) -> int:
     from bridged.status import query, render  # noqa: PLC0415
 
-    status = query(_status_path(args))
-    print(json.dumps(status, indent=2) if args.json else render(status))
+    path = _status_path(args)
+    clear = "\x1b[H\x1b[J" if args.watch and not args.json and sys.stdout.isatty() else ""
+    while True:
+        status = query(path)
+        text = json.dumps(status, indent=None if args.watch else 2) if args.json else render(status)
+        print(f"{clear}{text}", flush=True)
+        if not args.watch:
+            break
+        time.sleep(WATCH_INTERVAL_S)
     return 0 if status["state"] == "running" and status["bus"]["open"] else EXIT_NOT_RUNNING
 
 
@@ -152,6 +141,7 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
     status.add_argument("name", nargs="?", metavar="NAME", help="stem of the configuration's file name")
     status.add_argument("--socket", metavar="PATH", help="the status socket, if not at its usual place")
     status.add_argument("--json", action="store_true")
+    status.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
 
     simulate = add(
         "simulate", "Simulate an adapter on a pseudo terminal, or on a line that is there.", _simulate

@@ -10,6 +10,7 @@ from msgspec import Meta, Struct
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bridged import can
+from bridged.port_names import USB_DEVICE, port_problem
 from bridged.yaml_source import (
     Problems,
     Section,
@@ -62,6 +63,7 @@ InterfaceName = Annotated[str, Meta(min_length=1, description="the name of an in
 QueueLength = Annotated[int, Meta(ge=1, le=65_536, description="a number of frames from 1 to 65536")]
 Window = Annotated[int, Meta(ge=1, le=32, description="a number of unanswered frames from 1 to 32")]
 Interval = Annotated[float, Meta(ge=0.1, le=0.5, description="a number of seconds from 0.1 to 0.5")]
+Pause = Annotated[float, Meta(ge=0.01, le=3600, description="a number of seconds from 0.01 to 3600")]
 Deadline = Annotated[float, Meta(gt=0, le=3600, description="a number of seconds above 0 and up to 3600")]
 
 
@@ -160,6 +162,13 @@ class HealthConfig(Struct, frozen=True, kw_only=True):
     error_frames: Flag = True
 
 
+class ReconnectConfig(Struct, frozen=True, kw_only=True):
+    """The pause before the adapter is tried again: `initial_s`, then doubling up to `maximum_s`."""
+
+    initial_s: Pause = msgspec.field(default=0.1, name="initial")
+    maximum_s: Pause = msgspec.field(default=5.0, name="maximum")
+
+
 class Config(Struct, frozen=True, kw_only=True):
     """One bridge. `name` is the stem of the file's name."""
 
@@ -170,6 +179,7 @@ class Config(Struct, frozen=True, kw_only=True):
     bus: BusConfig
     transmit: TransmitConfig
     health: HealthConfig = HealthConfig()
+    reconnect: ReconnectConfig = ReconnectConfig()
 
 
 _SECTIONS: dict[str, type[Struct]] = {
@@ -179,6 +189,7 @@ _SECTIONS: dict[str, type[Struct]] = {
     "bus": _BusKeys,
     "transmit": _TransmitKeys,
     "health": HealthConfig,
+    "reconnect": ReconnectConfig,
 }
 
 _ADAPTERS: dict[str, type[AdapterConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
@@ -191,27 +202,11 @@ _KEYS_OF_OTHERS = {
     "usb2can": {"baudrate": "a FT245 has no baud rate: remove it"},
 }
 
-_SCHEMES = {"can232": ("socket", "rfc2217"), "usb2can": ("socket", "usb")}
-_SCHEMES_OF_OTHERS = {
-    "rfc2217": "rfc2217:// sets the baud rate of a serial line, and a FT245 has none; write socket://",
-    "usb": "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0",
-}
-
 _RESERVED_OPTIONS = {
     "bustype": "write interface",
     "receive_own_messages": "the bridge needs it off: it would send frames back to where they came from",
 }
 """Keyword arguments of can.Bus that are not for the user."""
-
-
-_LABEL = "[A-Za-z0-9_-]{1,63}"
-_ADDRESS = re.compile(
-    rf"(?:{_LABEL}(?:\.{_LABEL})*\.?|\[[0-9A-Fa-f:.]+(?:%[\w.-]+)?\]):([0-9]{{1,5}})/?(?:\?\S*)?", re.ASCII
-)
-"""HOST:PORT, [IPv6]:PORT, with pyserial's options: nas.local:4001, [fe80::1%eth0]:4001, h:1?logging=debug."""
-
-_USB_DEVICE = re.compile(r"[0-9A-Fa-f]{4}:[0-9A-Fa-f]{4}(?:/([!-~]{1,32}))?")
-"""VID:PID or VID:PID/SERIAL: 0403:6001, 0403:6001/A6008isP."""
 
 
 def load(path: str | os.PathLike[str]) -> Config:
@@ -246,7 +241,8 @@ def _read_file(path: Path, top: Section) -> Config | None:
     health: HealthConfig | None = HealthConfig()
     if "health" in top.nodes:
         health = _read_plain(top.section("health", required=False), HealthConfig)
-    if top.problems or not (adapter and channel and bus and transmit and health):
+    reconnect = _read_reconnect(top)
+    if top.problems or not (adapter and channel and bus and transmit and health and reconnect):
         return None
     return Config(
         name=path.stem,
@@ -256,6 +252,7 @@ def _read_file(path: Path, top: Section) -> Config | None:
         bus=bus,
         transmit=transmit,
         health=health,
+        reconnect=reconnect,
     )
 
 
@@ -285,7 +282,7 @@ def _read_adapter(section: Section | None) -> AdapterConfig | None:
                 section.refuse_key(key, why)
                 del section.keys[key]  # or it would be reported as unknown too
         adapter = _read_plain(section, _ADAPTERS[type_])
-    if text := _port_problem(section.values.get("port", "/"), type_):
+    if text := port_problem(section.values.get("port", "/"), type_):
         section.refuse_value("port", text)
     if type_ == "usb2can":
         _check_serial_number(section)
@@ -301,7 +298,7 @@ def _check_serial_number(section: Section) -> None:
         return
     if scheme == "socket":
         section.refuse_key("serial_number", "is the USB device's, unknown through socket://; remove it")
-    match = _USB_DEVICE.fullmatch(device)
+    match = USB_DEVICE.fullmatch(device)
     if scheme == "usb" and match and match[1] not in (None, serial_number):
         text = f"{quoted(serial_number)} is not the one in port, {quoted(match[1])}; remove one of them"
         section.refuse_value("serial_number", text)
@@ -349,28 +346,15 @@ def _window_problem(adapter: Can232Config, transmit: TransmitConfig) -> str | No
     return f"{taken}, {limit}, so they could be sent late; at most {room}"
 
 
-def _port_problem(port: str, adapter_type: str | None) -> str | None:
-    """What is wrong with a port for this type of adapter; None as the type: for any."""
-    scheme, separator, rest = port.partition("://")
-    if not separator:
-        if port.startswith("/"):
-            return None
-        return f"a device path begins with '/', such as /dev/ttyUSB0; {quoted(port)} does not"
-    schemes = ("socket", "rfc2217", "usb") if adapter_type is None else _SCHEMES[adapter_type]
-    if scheme not in schemes:
-        if text := _SCHEMES_OF_OTHERS.get(scheme):
-            return text
-        wanted = " or ".join(f"{name}://" for name in schemes)
-        return f"the URL of a port begins with {wanted}, not {quoted(scheme + separator)}"
-    if scheme == "usb":
-        if _USB_DEVICE.fullmatch(rest):
-            return None
-        wanted = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, is wanted"
-        return f"{wanted}, not {quoted(port)}"
-    address = _ADDRESS.fullmatch(rest)
-    if not address or not 1 <= int(address[1]) <= 65_535:
-        return f"{scheme}://HOST:PORT with a PORT from 1 to 65535 is wanted, not {quoted(port)}"
-    return None
+def _read_reconnect(top: Section) -> ReconnectConfig | None:
+    if "reconnect" not in top.nodes:
+        return ReconnectConfig()
+    section = top.section("reconnect", required=False)
+    reconnect = _read_plain(section, ReconnectConfig)
+    if section and reconnect and reconnect.initial_s > reconnect.maximum_s:
+        text = f"initial ({reconnect.initial_s:g} s) is more than maximum ({reconnect.maximum_s:g} s)"
+        section.refuse_value("maximum" if "maximum" in section.nodes else "initial", text)
+    return reconnect
 
 
 def _read_channel(section: Section | None) -> ChannelConfig | None:

@@ -62,6 +62,10 @@ class Observation:
     happened: Happened = Happened.NOTHING
 
 
+UNKNOWN = Observation("unknown")
+"""It did not answer."""
+
+
 def state_of(tec: int, rec: int) -> BusState:
     """The state that these error counters mean; bus-off cannot be told by them."""
     worst = max(tec, rec)

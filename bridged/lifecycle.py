@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+STABLE_S: Final = 60.0  # the adapter ran so long: what failed before is forgotten
+JITTER: Final = 0.2  # a pause is shorter by up to this part, so that many bridges do not try in step
+REPEAT_LOG_S: Final = 3600.0  # the same cause is told again
+TOLD_AT_MOST: Final = 5  # the same cause within that time
 
 
 class State(enum.Enum):
-    """Where the adapter is; the CAN bus state is another matter."""
+    """Where the adapter is; the CAN bus state is another matter.
+
+    There is no `recovering` on the open port: CLOSING and a port opened anew also cure a stuck tty or chip.
+    """
 
     IDLE = "idle"  # not started
+    WAITING = "waiting"  # there is no such device: nothing to open until it comes
     OPENING = "opening"  # the port is being opened
     INITIALISING = "initialising"  # the adapter is being identified and configured
     RUNNING = "running"  # frames are relayed
     REJECTING = "rejecting"  # wrong device, or it refuses its configuration; the channel is closed
     CLOSING = "closing"  # something failed; the channel is closed before the next try
-    BACKOFF = "backoff"  # waiting before the next try
+    BACKOFF = "backoff"  # a pause before the next try
     FAULT = "fault"  # after REJECTING: tried again slowly
     STOPPING = "stopping"  # told to stop; the channel is being closed
     STOPPED = "stopped"
@@ -22,8 +36,10 @@ class State(enum.Enum):
 
 class Event(enum.Enum):
     START = enum.auto()
+    APPEARED = enum.auto()  # the device was plugged in
     OPENED = enum.auto()
-    OPEN_FAILED = enum.auto()
+    ABSENT = enum.auto()  # not opened: there is no such device
+    OPEN_FAILED = enum.auto()  # not opened for any other reason
     READY = enum.auto()  # initialised
     UNANSWERED = enum.auto()  # a step of the initialisation had no answer
     REFUSED = enum.auto()  # wrong device, or a refused setting
@@ -35,13 +51,15 @@ class Event(enum.Enum):
 
 
 class Action(enum.Enum):
-    OPEN = enum.auto()  # open the port -> OPENED, OPEN_FAILED
+    LOOK = enum.auto()  # is the device there? -> APPEARED, or later TIMER or APPEARED
+    OPEN = enum.auto()  # open the port -> OPENED, ABSENT, OPEN_FAILED
     INITIALISE = enum.auto()  # -> READY, UNANSWERED, REFUSED
     RUN = enum.auto()  # open the gates
     CLOSE = enum.auto()  # close the gates, then the channel -> CLOSED
     RELEASE = enum.auto()  # give the port back
-    WAIT = enum.auto()  # -> TIMER
-    WAIT_LONG = enum.auto()  # -> TIMER
+    WAIT = enum.auto()  # -> TIMER, or APPEARED if the device is plugged in anew before
+    WAIT_LONG = enum.auto()  # the same
+    HURRY = enum.auto()  # pauses are short again
     FINISH = enum.auto()
 
 
@@ -51,7 +69,11 @@ Transition = tuple[State, tuple[Action, ...]]
 TABLE: dict[tuple[State, Event], Transition] = {
     (S.IDLE, E.START): (S.OPENING, (A.OPEN,)),
     (S.IDLE, E.STOP): (S.STOPPED, (A.FINISH,)),
+    (S.WAITING, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
+    (S.WAITING, E.TIMER): (S.WAITING, (A.LOOK,)),
+    (S.WAITING, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.OPENING, E.OPENED): (S.INITIALISING, (A.INITIALISE,)),
+    (S.OPENING, E.ABSENT): (S.WAITING, (A.LOOK,)),
     (S.OPENING, E.OPEN_FAILED): (S.BACKOFF, (A.WAIT,)),
     (S.OPENING, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.INITIALISING, E.READY): (S.RUNNING, (A.RUN,)),
@@ -69,8 +91,10 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.REJECTING, E.PORT_LOST): (S.FAULT, (A.RELEASE, A.WAIT_LONG)),
     (S.REJECTING, E.STOP): (S.STOPPING, (A.CLOSE,)),
     (S.BACKOFF, E.TIMER): (S.OPENING, (A.OPEN,)),
+    (S.BACKOFF, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
     (S.BACKOFF, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.FAULT, E.TIMER): (S.OPENING, (A.OPEN,)),
+    (S.FAULT, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
     (S.FAULT, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.STOPPING, E.CLOSED): (S.STOPPED, (A.RELEASE, A.FINISH)),
     (S.STOPPING, E.PORT_LOST): (S.STOPPED, (A.RELEASE, A.FINISH)),
@@ -81,8 +105,11 @@ TABLE: dict[tuple[State, Event], Transition] = {
 # Late news, without meaning for the state they meet.
 IGNORED: frozenset[tuple[State, Event]] = frozenset(
     [(S.CLOSING, E.SILENT), (S.REJECTING, E.SILENT), (S.STOPPING, E.SILENT), (S.STOPPING, E.STOP)]
-    + [(S.BACKOFF, E.PORT_LOST), (S.FAULT, E.PORT_LOST)]  # came with the news that ended it
-    + [(S.STOPPED, event) for event in (E.STOP, E.OPEN_FAILED, E.PORT_LOST)]
+    # They came with the news that ended it.
+    + [(state, event) for state in (S.BACKOFF, S.FAULT) for event in (E.PORT_LOST, E.SILENT)]
+    + [(S.STOPPED, event) for event in (E.STOP, E.ABSENT, E.OPEN_FAILED, E.PORT_LOST, E.SILENT)]
+    # Only WAITING, BACKOFF and FAULT look out for the device; the news may be on its way when they end.
+    + [(state, E.APPEARED) for state in S if state not in {S.IDLE, S.WAITING, S.BACKOFF, S.FAULT}]
 )
 
 
@@ -94,17 +121,83 @@ def transition(state: State, event: Event) -> Transition:
 
 
 class Backoff:
-    """Seconds until the next try: doubling from `initial_s` to `maximum_s` until reset()."""
+    """Seconds until the next try: doubling from `initial_s` to `maximum_s`, each with jitter.
 
-    def __init__(self, initial_s: float, maximum_s: float) -> None:
+    They are short again after hurry(), and after the adapter ran for STABLE_S: running for a moment only
+    is no reason to hurry. `random` gives 0 to 1; `now` is any clock in seconds.
+    """
+
+    def __init__(self, initial_s: float, maximum_s: float, random: Callable[[], float]) -> None:
         self._initial_s = initial_s
         self._maximum_s = maximum_s
+        self._random = random
         self._next_s = initial_s
+        self._running_since: float | None = None
 
-    def next_s(self) -> float:
+    def runs(self, now: float) -> None:
+        """The adapter runs, until next_s() or longest_s() is called."""
+        self._running_since = now
+
+    def next_s(self, now: float) -> float:
+        if self._running_since is not None and now - self._running_since >= STABLE_S:
+            self.hurry()
+        self._running_since = None
         delay = self._next_s
         self._next_s = min(self._maximum_s, 2 * delay)
-        return delay
+        return self._with_jitter(delay)
 
-    def reset(self) -> None:
+    def longest_s(self) -> float:
+        """For what will hardly mend itself."""
+        self._running_since = None
+        return self._with_jitter(self._maximum_s)
+
+    def hurry(self) -> None:
         self._next_s = self._initial_s
+
+    def _with_jitter(self, delay_s: float) -> float:
+        return delay_s * (1 - JITTER * self._random())
+
+
+@dataclass(slots=True)
+class _Cause:
+    told_at: float
+    left: int  # how often it may be told until REPEAT_LOG_S have passed
+    untold: int = 0  # how often it came without being told
+    again: bool = False  # all was well since: it is news
+
+
+class Told:
+    """Which causes are in the log: each is told once until all is well again, and not too often then."""
+
+    def __init__(self) -> None:
+        self.failing = False  # something came since all was well
+        self.quiet = False  # and nothing was told since
+        self._causes: dict[str, _Cause] = {}
+
+    def tell(self, cause: str, now: float) -> int | None:
+        """How often it came since it was told, this time included; None: not to be told this time."""
+        self.failing = True
+        known = self._causes.get(cause)
+        if known is not None and now - known.told_at < REPEAT_LOG_S:
+            if not (known.again and known.left):
+                known.untold += 1
+                return None
+            known.left -= 1
+            known.again = False
+        else:
+            # Twice as long, so that one which comes back now and then is told with its count.
+            self._causes = {
+                text: entry for text, entry in self._causes.items() if now - entry.told_at < 2 * REPEAT_LOG_S
+            }
+            self._causes[cause] = _Cause(now, TOLD_AT_MOST - 1)
+        self.quiet = False
+        times = 1 + (known.untold if known else 0)
+        self._causes[cause].untold = 0
+        return times
+
+    def well(self) -> None:
+        """Nothing fails any more: what comes now is news, unless it came very often."""
+        self.failing = False
+        self.quiet = True
+        for cause in self._causes.values():
+            cause.again = True

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridged.adapters.base import Reply
 from bridged.errors import AdapterError
-from bridged.health import BusState, Happened, Health, Observation
+from bridged.health import UNKNOWN, BusState, Happened, Health, Observation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 LOG_INTERVAL_S = 10.0
 RATE_PERIOD_S = 1.0
 ANSWER_TIMES = 256
+UNKNOWN_LIMIT = 4
 
 
 class HealthPolling:
@@ -57,6 +58,7 @@ class HealthPolling:
             deque()
         )  # time, frames to the bus, frames to the adapter
         self._steps: HealthSteps | None = None
+        self._unknown = 0  # looks one after the other without an answer
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
         self._logged: dict[str, float] = {}  # what was in the log, and when
@@ -64,6 +66,7 @@ class HealthPolling:
     def start(self, now: float) -> None:
         """The adapter runs."""
         self._overruns_seen = self._counters()["rx_overruns"]
+        self._unknown = 0
         self.next_at = now
 
     def stop(self) -> None:
@@ -102,10 +105,15 @@ class HealthPolling:
 
     def heard(self, text: bytes) -> None:
         """What the adapter said unasked."""
-        seen = self._adapter.read_report(text)
         log.debug("adapter said %r unasked", text)
-        running = self.next_at is not None or self._steps is not None
-        if seen is not None and running:
+        if self.next_at is None and self._steps is None:
+            return
+        try:
+            seen = self._adapter.read_report(text)
+        except AdapterError as error:
+            self._failed(str(error))
+            return
+        if seen is not None:
             self._warn("adapter reports: %s", seen.description)
             self._overtaken = self._overtaken or seen.state is not None
             self._take(seen)
@@ -141,6 +149,10 @@ class HealthPolling:
         if self._overtaken:
             seen = dataclasses.replace(seen, state=None, tec=None, rec=None)
         self._take(seen)
+        self._unknown = self._unknown + 1 if seen is UNKNOWN else 0
+        if self._unknown == UNKNOWN_LIMIT:
+            self._failed("the adapter does not answer questions about its bus")
+            return
         counters = self._counters()
         self._sample(time.monotonic(), counters["rx_frames"], counters["tx_frames"])
         overruns = counters["rx_overruns"]

@@ -11,28 +11,49 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+from bridged.errors import ConfigError
+from bridged.lifecycle import State
+from bridged.notify import Notifier
+
 if TYPE_CHECKING:
     from types import FrameType
 
     from bridged.bridge import Bridge
+    from bridged.config import Config
     from bridged.status import StatusServer
 
 log = logging.getLogger(__name__)
 
 Handler = Callable[[], None]
-# SIGHUP comes when the terminal of a bridge in the foreground goes.
-STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+# The bridge that is to take the place of one with this configuration; None: nothing has changed. ConfigError.
+Successor = Callable[["Config"], "Bridge | None"]
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+
+
+def hangup_means_reload() -> bool:
+    """What SIGHUP is for: the end of the terminal that the bridge runs in, or a service's sign to reload.
+
+    INVOCATION_ID tells nothing: whatever is started in a terminal of some desktops inherits it.
+    """
+    if "NOTIFY_SOCKET" in os.environ:
+        return True
+    try:
+        os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY | os.O_CLOEXEC))
+    except OSError:  # ENXIO: no controlling terminal
+        return True
+    return False
 
 
 @contextlib.contextmanager
-def _stop_signals() -> Iterator[int]:
-    """A descriptor that becomes readable when one of STOP_SIGNALS comes; ends a select() at once."""
+def _signals() -> Iterator[int]:
+    """A descriptor that becomes readable when one of SIGNALS comes; ends a select() at once."""
     reader, writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def nothing(_number: int, _frame: FrameType | None) -> None:
         """The number comes through the pipe."""
 
-    before = {number: signal.signal(number, nothing) for number in STOP_SIGNALS}
+    before = {number: signal.signal(number, nothing) for number in SIGNALS}
     descriptor = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     try:
         yield reader
@@ -46,35 +67,155 @@ def _stop_signals() -> Iterator[int]:
 
 def serve(bridge: Bridge, status: StatusServer | None) -> None:
     """Runs the bridge until a signal has stopped it and its adapter is closed."""
-    with _stop_signals() as signals, selectors.DefaultSelector() as selector:
+    Service(bridge).run(status)
 
-        def on_signal() -> None:
-            number = os.read(signals, 64)[0]
-            log.info("%s: stopping", signal.Signals(number).name)
-            bridge.stop()
 
-        selector.register(signals, selectors.EVENT_READ, on_signal)
-        for fd in bridge.filenos():
-            selector.register(fd, selectors.EVENT_READ, bridge.on_readable)
-        if status is not None:
-            selector.register(status, selectors.EVENT_READ, status.on_readable)
+class Service:
+    """Runs `bridge`, and after each SIGHUP the one that `successor` makes; without it SIGHUP is a stop.
+
+    The adapter of the old one is closed before the new one opens its own. The process, the status socket and,
+    unless its section has changed, the open bus stay: frames sent meanwhile wait there.
+    """
+
+    def __init__(
+        self, bridge: Bridge, notifier: Notifier | None = None, successor: Successor | None = None
+    ) -> None:
+        self.bridge = bridge
+        self._notifier = notifier or Notifier()
+        self._make_successor = successor
+        self._successor: Bridge | None = None  # waits for the end of `bridge`
+        self._ready = False
+        self._status = ""
+        self._refusal = ""  # why the last reload was refused
+        self._feed_at: float | None = None
+
+    def run(self, status: StatusServer | None = None) -> None:
+        """Runs until a signal has stopped it and the adapter is closed."""
+        with _signals() as signals, selectors.DefaultSelector() as selector:
+            selector.register(signals, selectors.EVENT_READ, lambda: self._on_signals(signals))
+            if status is not None:
+                selector.register(status, selectors.EVENT_READ, status.on_readable)
+            self._watch(selector)
+            try:
+                self.bridge.start()
+                self._tell()
+                while not self.bridge.finished or self._successor is not None:
+                    self._turn(selector)
+                    if self._successor is not None and self.bridge.settled:
+                        self._succeed(selector, self._successor)
+                    self._tell()
+            except BaseException:
+                self.bridge.abort()
+                raise
+            finally:
+                self.bridge.close()
+
+    def _watch(self, selector: selectors.BaseSelector) -> None:
+        for fd in self.bridge.filenos():
+            selector.register(fd, selectors.EVENT_READ, self.bridge.on_readable)
+
+    def _turn(self, selector: selectors.BaseSelector) -> None:
+        timers = [] if self.bridge.finished else [self.bridge.next_timer()]
+        timer = min((at for at in (*timers, self._feed_at) if at is not None), default=None)
+        timeout = None if timer is None else max(0.0, timer - time.monotonic())
+        # One handler may serve several descriptors; it runs once.
+        handlers: dict[Handler, None] = {key.data: None for key, _ in selector.select(timeout)}
+        for handler in handlers:
+            handler()
+        if not self.bridge.finished:
+            self.bridge.on_timer(time.monotonic())
+        self._feed(time.monotonic())
+
+    # --- signals ------------------------------------------------------------------------------
+
+    def _on_signals(self, fd: int) -> None:
+        for number in os.read(fd, 64):
+            if number == signal.SIGHUP and self._make_successor is not None:
+                self._reload(self._make_successor)
+            else:
+                self._stop(signal.Signals(number).name)
+
+    def _stop(self, name: str) -> None:
+        log.info("%s: stopping", name)
+        self._notifier.stopping()
+        self._discard_successor()
+        self.bridge.stop()
+
+    def _reload(self, make_successor: Successor) -> None:
+        if self.bridge.state in {State.STOPPING, State.STOPPED} and self._successor is None:
+            return  # told to stop before
+        self._notifier.reloading()
         try:
-            bridge.start()
-            while not bridge.finished:
-                _turn(bridge, selector)
-        except BaseException:
-            bridge.abort()
-            raise
-        finally:
-            bridge.close()
+            successor = make_successor((self._successor or self.bridge).config)
+        except ConfigError as error:
+            for problem in error.problems:
+                log.error("reload refused: %s", problem)
+            self._refusal = error.problems[0]
+            self._notifier.ready()
+            return
+        self._refusal = ""
+        if successor is None:
+            log.info("reload: nothing has changed")
+            self._notifier.ready()
+            return
+        log.info("reload: the configuration has changed, the adapter is opened anew")
+        self._discard_successor()
+        self._successor = successor
+        self.bridge.stop()
+
+    def _discard_successor(self) -> None:
+        if self._successor is not None:
+            self._successor.close()
+            self._successor = None
+
+    def _succeed(self, selector: selectors.BaseSelector, successor: Bridge) -> None:
+        old = self.bridge
+        for fd in old.filenos():
+            selector.unregister(fd)
+        bus = old.hand_over_bus() if successor.config.bus == old.config.bus else None
+        old.close()
+        self.bridge, self._successor = successor, None
+        self._watch(selector)
+        self.bridge.start(bus)
+        self._notifier.ready()
+
+    # --- systemd ------------------------------------------------------------------------------
+
+    def _tell(self) -> None:
+        state, reason, bus_open = self.bridge.condition()
+        self._status = _describe(self.bridge, state, reason, bus_open=bus_open) or self._status
+        refusal = f" (reload refused: {self._refusal})" if self._refusal else ""
+        self._notifier.status(self._status + refusal)
+        if bus_open and not self._ready:
+            self._ready = True
+            self._notifier.ready()
+            if self._notifier.feed_interval_s is not None:
+                self._feed_at = time.monotonic()
+
+    def _feed(self, now: float) -> None:
+        """Feeds the watchdog if the relay has turned since the last time: each feeding gives it cause to."""
+        interval_s = self._notifier.feed_interval_s
+        if interval_s is None or self._feed_at is None or now < self._feed_at:
+            return
+        self._feed_at = now + interval_s
+        if self.bridge.finished or self.bridge.has_turned():
+            self._notifier.feed()
+        else:
+            log.error("the relay hangs: systemd's watchdog is not fed any more")
 
 
-def _turn(bridge: Bridge, selector: selectors.BaseSelector) -> None:
-    timer = bridge.next_timer()
-    timeout = None if timer is None else max(0.0, timer - time.monotonic())
-    # One handler may serve several descriptors; it runs once.
-    handlers: dict[Handler, None] = {key.data: None for key, _ in selector.select(timeout)}
-    for handler in handlers:
-        handler()
-    if not bridge.finished:
-        bridge.on_timer(time.monotonic())
+def _describe(bridge: Bridge, state: State, reason: str, *, bus_open: bool) -> str:
+    """The line for `systemctl status`; empty between two tries, where the last one goes on."""
+    adapter = bridge.config.adapter
+    if state in {State.STOPPING, State.STOPPED}:
+        return "stopping"
+    if not bus_open:
+        return f"bus not open: {reason}"
+    if state is State.RUNNING:
+        identity = bridge.adapter.identity
+        words = [adapter.type.upper(), identity.version or "", identity.serial_number or ""]
+        but = f", but {reason}" if reason else ""
+        return f"running: {' '.join(filter(None, words))} on {adapter.port}, {bridge.config.bus.channel}{but}"
+    if state is State.FAULT:
+        return f"fault: {reason}"
+    return f"waiting: {reason}" if state in {State.WAITING, State.BACKOFF} and reason else ""

@@ -6,6 +6,7 @@ adapter {type, port, version, serial_number}, bus {interface, channel, open},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
 from the adapter; tx_retries: frames sent once more; tx_returned: frames the adapter handed back; tx_stops,
 rx_overruns: how often it said "stop", "I lost frames"; bus_off_restarts; error_frames: put on the bus;
+tx_discarded: of tx_frames, those that did not leave the adapter's own buffer for so long that it was emptied;
 tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
 At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_READ).
 """

@@ -110,4 +110,4 @@ class Adapter(Protocol):
         """Bytes that mean nothing came while the adapter is being initialised."""
 
     def read_report(self, text: bytes) -> Observation | None:
-        """What the device said unasked; None if there is nothing to it."""
+        """What the device said unasked; None if there is nothing to it. AdapterError as health_steps."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Memory, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.health import BusState, Happened, Observation
+from bridged.health import UNKNOWN, BusState, Happened, Observation
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -225,7 +225,7 @@ class Can232:
         if answer.reply is REFUSED:
             raise AdapterError("the adapter's channel is closed: it was reset, or lost its power")
         if not re.fullmatch(b"F[0-9A-Fa-f]{2}", answer.text):
-            return Observation("unknown")
+            return UNKNOWN
         flags = int(answer.text[1:], 16)
         happened = Happened.NOTHING
         for bit, what in HAPPENED.items():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Polling, Reply, Steps
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.health import BusState, Happened, Observation, state_of
+from bridged.health import UNKNOWN, BusState, Happened, Observation, state_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -40,6 +40,7 @@ ANSWER_TIMEOUT_S: Final = 0.3
 MODE_TRIES = 5  # a half message of another program swallows up to 16 bytes, one try has 6
 DRAIN_LOOKS = 10  # at a transmit buffer that no frame leaves, until the channel is closed all the same
 DRAIN_INTERVAL_S: Final = 0.01  # between two of them; the longest frame takes 15 ms at 10 kbit/s
+DRAIN_LOOKS_MAX = 40
 NOISE_KEPT = 256  # bytes
 FMS_SERIES, LOAD_SERIES = "7", "2"  # of the firmware: the y of HWxxxxFWyzzz
 
@@ -51,17 +52,27 @@ COUNTERS = bytes((START, COMMAND, 1, ENABLE_READ_TEC, START, COMMAND, 1, ENABLE_
 """What lets READ_TEC and READ_REC be answered."""
 
 
+def message(command: int, *data: int) -> bytes:
+    """One message to the device: `0F 12 02 00 01` writes 0x01 to register 0."""
+    return bytes((START, command, len(data), *data))
+
+
+HEALTH_REQUESTS = {
+    READ_TEC: message(READ_TEC),
+    READ_REC: message(READ_REC),
+    READ_RST: message(READ_RST),
+    READ_REG: message(READ_REG, SR),
+}
+HEALTH_LENGTHS = {READ_TEC: 1, READ_REC: 1, READ_RST: 2, READ_REG: 2}
+"""What says how the bus is, and the lengths of the answers."""
+
+
 class Levels(NamedTuple):
     """What COMMAND GET tells."""
 
     critical: int
     ready: int
     waiting: int  # frames in both transmit buffers
-
-
-def message(command: int, *data: int) -> bytes:
-    """One message to the device: `0F 12 02 00 01` writes 0x01 to register 0."""
-    return bytes((START, command, len(data), *data))
 
 
 def _exchange(request: bytes, purpose: str, prefix: bytes, *, optional: bool = False) -> Exchange:
@@ -89,8 +100,8 @@ class Usb2can:
         self._levels_prefix: bytes | None = None  # how this firmware begins its answer to COMMAND GET
         self._health: dict[int, Exchange] = {}  # what is asked to know how the bus is
         self._restarts: bytes | None = None  # as READ_RST tells them: in which byte order is not said
-        self._status_exchange = _exchange(
-            message(READ_REG, SR), "tell its status register", bytes((READ_REG, 2, SR)), optional=True
+        self._mode_exchange = _exchange(
+            message(GET_MODE), "tell its mode", bytes((GET_MODE, 1)), optional=True
         )
         self.identity = Identity()
         self.flow: Flow | None = None
@@ -140,13 +151,16 @@ class Usb2can:
     def _drain(self) -> Steps:
         """Waits while frames leave its transmit buffer; a pause is a question whose answer is not awaited."""
         fewest, looks = math.inf, DRAIN_LOOKS
-        while looks:
+        for _ in range(DRAIN_LOOKS_MAX):
             levels = yield from self._read_levels()
             if levels is None or not levels.waiting:
                 return
             looks = DRAIN_LOOKS if levels.waiting < fewest else looks - 1
             fewest = min(fewest, levels.waiting)
+            if not looks:
+                break
             yield Exchange(message(GET_MODE), "wait", (NONE,), (), timeout_s=DRAIN_INTERVAL_S)
+        log.warning("%d frames did not leave the adapter: they are thrown away with its buffer", fewest)
 
     def _in_config_mode(self, request: bytes) -> Exchange:
         """A request that nothing acknowledges, and GET_MODE, whose answer comes when it is done."""
@@ -301,26 +315,32 @@ class Usb2can:
     def _find_health(self) -> Steps:
         """Which of the questions about the bus this firmware answers."""
         self._health = {}
-        for command in (READ_TEC, READ_REC, READ_RST):
-            prefix = bytes((command, 2 if command == READ_RST else 1))
-            exchange = _exchange(message(command), "tell its error counters", prefix, optional=True)
+        answer = Answer(NONE)
+        for command, request in HEALTH_REQUESTS.items():
+            exchange = _exchange(
+                request, "tell how its bus is", bytes((command, HEALTH_LENGTHS[command])), optional=True
+            )
             answer = yield exchange
             if answer.reply is TEXT:
                 self._health[command] = exchange
-        self._restarts = answer.text[2:] if answer.reply is TEXT else None
+            if command == READ_RST:
+                self._restarts = answer.text[2:]
 
     def health_steps(self) -> HealthSteps:
-        """Error counters, restarts after bus-off, and from the SJA1000's status whether it is bus-off."""
+        """Its mode, error counters, restarts after bus-off, and whether it is bus-off now."""
+        mode = yield self._mode_exchange
+        if mode.reply is TEXT and mode.text[2] != NORMAL:
+            raise AdapterError(_wrong_mode(mode.text[2]))
         answers = {}
         for command, exchange in self._health.items():
             answers[command] = (yield exchange).text[2:]
-        status = yield self._status_exchange
-        if status.reply is NONE or not all(answers.values()):
-            return Observation("unknown")
+        if mode.reply is NONE or not all(answers.values()):
+            return UNKNOWN
         restarted = answers.get(READ_RST) != self._restarts
         self._restarts = answers.get(READ_RST)
         tec, rec = answers.get(READ_TEC), answers.get(READ_REC)
-        bus_off = bool(status.text[-1] & BUS_STATUS)
+        status = answers.get(READ_REG)
+        bus_off = bool(status and status[-1] & BUS_STATUS)
         return _observation(
             "bus-off" if bus_off else "bus good",
             bus_off=bus_off,
@@ -339,7 +359,7 @@ class Usb2can:
             crossed = "error counters crossed the warning limit"
             return _observation(crossed, tec=text[6 + shift], rec=text[5 + shift])
         if text[0] == GET_MODE and self.flow and text[2] != NORMAL:
-            return Observation(f"mode {MODE_NAMES[text[2]]}: it was reset, or another program uses it")
+            raise AdapterError(_wrong_mode(text[2]))
         return None
 
     def saw_time_stamps(self) -> None:
@@ -347,6 +367,10 @@ class Usb2can:
 
     def saw_noise(self, noise: bytes) -> None:
         self._noise += noise[: NOISE_KEPT - len(self._noise)]
+
+
+def _wrong_mode(mode: int) -> str:
+    return f"the adapter is in mode {MODE_NAMES[mode]}: it was reset, or another program uses it"
 
 
 def _observation(

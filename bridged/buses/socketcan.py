@@ -92,6 +92,15 @@ def open_socketcan(channel: str, create: bool) -> SocketcanBus:
     return SocketcanBus(channel, sock, warning)
 
 
+def is_up(channel: str) -> bool:
+    """Whether there is such an interface, and it is up."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as any_socket:  # netdevice(7): any will do
+        try:
+            return bool(_ifreq(any_socket, _SIOCGIFFLAGS, channel)[1] & _IFF_UP)
+        except OSError:
+            return False
+
+
 def _raw_socket() -> socket.socket:
     try:
         return socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)

@@ -38,6 +38,15 @@ static uint32_t room_above(const struct flow *f, uint32_t level)
     return f->capacity > used ? f->capacity - used : 0;
 }
 
+/* The oldest frame may have been taken or not. */
+static void sent_unanswered(struct relay *r)
+{
+    const struct tx_frame lost = sent_pop(&r->flow);
+    r->flow.doubted -= r->flow.doubted > 0;
+    queue_drop(r, TX_UNANSWERED);
+    queue_overtake(r, &lost);
+}
+
 /* The device is initialised: `set` says what to ask and what its buffer holds. */
 void flow_start(struct relay *r, const struct flow *set)
 {
@@ -52,10 +61,8 @@ void flow_start(struct relay *r, const struct flow *set)
 void flow_reset(struct relay *r)
 {
     struct flow *f = &r->flow;
-    while (f->sent_count) {
-        sent_pop(f);
-        queue_drop(r, TX_UNANSWERED);
-    }
+    while (f->sent_count)
+        sent_unanswered(r);
     *f = (struct flow){.limit = r->set.window, .ask_delay_ns = ASK_FIRST_NS};
 }
 
@@ -101,13 +108,18 @@ static void ask_again_at(struct flow *f, int64_t now)
     f->ask_delay_ns *= f->ask_delay_ns < ASK_LAST_NS ? 2 : 1;
 }
 
-/* The oldest frame may have been taken or not. */
-static void sent_unanswered(struct relay *r)
+/* The device says how many frames are in its buffer, `taken` more than at the last time. */
+static void level_observe(struct relay *r, uint32_t level, uint32_t taken, int64_t now)
 {
-    const struct tx_frame lost = sent_pop(&r->flow);
-    r->flow.doubted -= r->flow.doubted > 0;
-    queue_drop(r, TX_UNANSWERED);
-    queue_overtake(r, &lost);
+    struct flow *f = &r->flow;
+    bool left = !f->level || level < f->level + taken;
+    f->level = level;
+    if (left)
+        f->left_at_ns = now;
+    if (!level || now - f->left_at_ns <= r->set.deadline_ns)
+        return;
+    f->left_at_ns = NEVER; /* said once */
+    relay_emit(r, EVENT_STUCK, level, NULL, 0);
 }
 
 /* Noise may have been a frame that was handed back: then nothing is certain. */
@@ -115,6 +127,7 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
 {
     struct flow *f = &r->flow;
     bool grows = false;
+    uint32_t taken_count = f->asked;
     if (r->count.skipped_bytes != f->noise)
         f->doubted = f->sent_count;
     f->noise = r->count.skipped_bytes;
@@ -138,11 +151,15 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
     if (f->stopped)
         f->stopped = !(level >= 0 && level < (int)f->ready) && now - f->stopped_ns < STOP_LIMIT_NS;
     if (level >= 0)
+        level_observe(r, (uint32_t)level, taken_count, now);
+    if (level >= 0)
         f->room = room_above(f, (uint32_t)level);
     else
         f->room = f->critical < f->capacity ? room_above(f, f->critical) : !f->sent_count;
     if (f->stopped || !f->room)
         ask_again_at(f, now);
+    else if (f->level)
+        f->ask_at_ns = now + STOP_LOOK_NS;
 }
 
 /* Its answer was lost: the frames before it may have been taken, or handed back in what was lost. */
@@ -163,15 +180,24 @@ static bool frames_equal(const struct can_frame *a, const struct can_frame *b)
     return a->can_id == b->can_id && a->len == b->len && !memcmp(a->data, b->data, data);
 }
 
+/* Which of `sent` the device hands back, sent_count if none: of equal ones the newest, since it is the
+ * newest that finds a buffer full, but none after a question that is not answered yet. */
+static uint32_t sent_find(struct flow *f, const struct can_frame *frame)
+{
+    for (uint32_t i = f->asking ? f->asked : f->sent_count; i > 0; i--)
+        if (frames_equal(&sent_at(f, i - 1)->frame, frame))
+            return i - 1;
+    return f->sent_count;
+}
+
 /* Handed back: into its place before those not sent yet. One that is not ours is not sent. */
 static void frame_returned(struct relay *r, const struct can_frame *frame, int64_t now)
 {
     struct flow *f = &r->flow;
-    uint32_t i = 0;
-    while (i < f->sent_count && !frames_equal(&sent_at(f, i)->frame, frame))
-        i++;
+    uint32_t i = sent_find(f, frame);
     if (i == f->sent_count) {
         r->count.stray_answers++;
+        f->doubted = f->sent_count; /* or one of ours, damaged */
         return;
     }
     struct tx_frame tx = *sent_at(f, i);
@@ -200,8 +226,9 @@ void flow_message(struct relay *r, enum codec_kind kind, const struct can_frame 
         frame_returned(r, frame, now);
     } else if (kind == CODEC_STOP) {
         r->count.stops++;
+        if (!f->stopped)
+            f->stopped_ns = now; /* some firmware repeats it */
         f->stopped = true;
-        f->stopped_ns = now;
         ask_again_at(f, now);
     } else if (f->stopped) {
         f->stopped = false;
@@ -213,6 +240,7 @@ void flow_message(struct relay *r, enum codec_kind kind, const struct can_frame 
 int64_t flow_deadline(const struct relay *r)
 {
     const struct flow *f = &r->flow;
-    bool looks = f->ask.length && !f->asking && !f->sent_count && (f->stopped || !f->room);
-    return looks && queue_waiting(r) ? f->ask_at_ns : NEVER;
+    bool blocked = queue_waiting(r) && (f->stopped || !f->room);
+    bool looks = f->ask.length && !f->asking && !f->sent_count && r->gate == GATE_OPEN && !r->silent;
+    return looks && (blocked || f->level) ? f->ask_at_ns : NEVER;
 }

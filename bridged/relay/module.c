@@ -31,6 +31,7 @@ static const struct {
     {"EVENT_FRAME_REFUSED", EVENT_FRAME_REFUSED},
     {"EVENT_UNANSWERED", EVENT_UNANSWERED},
     {"EVENT_SILENT", EVENT_SILENT},
+    {"EVENT_STUCK", EVENT_STUCK},
     {"EVENT_STAMPED", EVENT_STAMPED},
     {"EVENT_PORT_LOST", EVENT_PORT_LOST},
     {"EVENT_BUS_DOWN", EVENT_BUS_DOWN},
@@ -183,6 +184,12 @@ static PyObject *Relay_stop(PyObject *self, PyObject *Py_UNUSED(ignored))
     struct relay *r = relay_lock(self);
     r->stop = true;
     return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_wake(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    relay_wake(self_relay(self));
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_fileno(PyObject *self, PyObject *Py_UNUSED(ignored))
@@ -418,6 +425,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"run", Relay_run, METH_NOARGS, NULL},
     {"turn", Relay_turn, METH_O, NULL},
     {"stop", Relay_stop, METH_NOARGS, NULL},
+    {"wake", Relay_wake, METH_NOARGS, NULL},
     {"fileno", Relay_fileno, METH_NOARGS, NULL},
     {"attach_port", Relay_attach_port, METH_O, NULL},
     {"detach_port", Relay_detach_port, METH_NOARGS, NULL},

@@ -73,6 +73,7 @@ enum event_kind {
     EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many retries so far. Not at each */
     EVENT_UNANSWERED,    /* an answer is missing: the line is being resynchronised */
     EVENT_SILENT,    /* not even the sync command is answered; nothing is sent until a new attach */
+    EVENT_STUCK,     /* frames are in the device's buffer and none has left it for the deadline; token: how many */
     EVENT_STAMPED,   /* a frame had a time stamp; said once per attach */
     EVENT_PORT_LOST, /* token: errno, 0 for end of file */
     EVENT_BUS_DOWN,  /* the interface is down */
@@ -163,6 +164,8 @@ struct flow {
     uint32_t sent_head, sent_count;
     uint32_t asked;        /* how many of them the question in flight covers */
     uint32_t room;         /* frames that fit surely */
+    uint32_t level;        /* frames in the device's buffer when it said so last; 0: not known */
+    int64_t left_at_ns;    /* when one was seen to have left it last */
     uint32_t limit;        /* of sent_count: 1 after frames came back, doubled until it is the window again */
     uint64_t noise;        /* counters.skipped_bytes when `sent` was empty or a question answered last */
     uint32_t doubted;      /* the oldest of `sent`: noise since may have been one handed back */

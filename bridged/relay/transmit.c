@@ -305,10 +305,11 @@ static void check_answers(struct relay *r, int64_t now)
     }
     while (r->inflight_count && inflight_at(r, 0)->deadline_ns <= now) {
         enum inflight_kind kind = inflight_at(r, 0)->kind;
-        bool frame = kind == INFLIGHT_FRAME || kind == INFLIGHT_LEVEL;
+        bool live = r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY;
+        bool frame = kind == INFLIGHT_FRAME || (kind == INFLIGHT_LEVEL && live);
         if (!frame) /* a frame keeps its place: its answer may only be late */
             inflight_give_up(r);
-        if (frame || r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY) {
+        if (frame || live) {
             resync_start(r, now);
             return;
         }

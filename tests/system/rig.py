@@ -187,7 +187,7 @@ class Bridge(Process):
             timeout=DEADLINE_S,
             check=False,
         )
-        return dict(json.loads(asked.stdout)) if asked.returncode == 0 else {}
+        return dict(json.loads(asked.stdout)) if asked.stdout else {}
 
     def wait_status(
         self, condition: Callable[[dict[str, Any]], bool], what: str, deadline_s: float = DEADLINE_S
@@ -309,6 +309,15 @@ class Chip:
             **{"always-plugged": True},
         )
         self.wait_tty()
+
+    def restore(self) -> None:
+        """Plugged in, with the kernel's driver: a bridge that was killed has not given it back."""
+        usb = self.usb
+        if usb is None:
+            self.plug()
+        elif self.tty is None:
+            Path("/sys/bus/usb/drivers_probe").write_text(f"{usb.name}:1.0")
+            self.wait_tty()
 
 
 def ask_monitor(command: str, **arguments: Any) -> Any:
@@ -441,8 +450,7 @@ class Rig:
         for process in reversed(self._processes):
             process.kill()
         for chip in self._chips:
-            if chip.usb is None:
-                chip.plug()
+            chip.restore()
         for descriptor in self._descriptors:
             os.close(descriptor)
         for interface in self._interfaces:

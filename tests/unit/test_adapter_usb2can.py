@@ -468,6 +468,14 @@ def test_health(device: Device) -> None:
     assert (seen.state, seen.happened) == (BusState.ERROR_ACTIVE, Happened.NOTHING)
 
 
+def test_health_of_a_device_in_another_mode(device: Device) -> None:
+    """It would answer the questions about its buffer, and take no frame."""
+    host = started(device)
+    ask(device, MODES["config"])
+    with pytest.raises(AdapterError, match="is in mode CONFIG"):
+        looked(host)
+
+
 def test_health_of_a_device_that_is_silent() -> None:
     device = Device()
     host = started(device)
@@ -491,8 +499,11 @@ def test_reports() -> None:
     assert describe(bytes((ERROR, 6, 1, 0, 0x19, 3, 96, 0x40))) == crossed
     assert describe(bytes((ERROR, 7, 1, 0x40, 0, 0x19, 3, 96, 0x40))) == crossed
     assert describe(bytes((GET_MODE, 1, 2))) is None
-    assert describe(bytes((GET_MODE, 1, 0))) == "mode BOOT: it was reset, or another program uses it"
-    assert describe(bytes((GET_MODE, 1, 3))) == "mode LOOPBACK: it was reset, or another program uses it"
+    for mode, name in {0: "BOOT", 1: "CONFIG", 3: "LOOPBACK"}.items():
+        with pytest.raises(
+            AdapterError, match=f"is in mode {name}: it was reset, or another program uses it"
+        ):
+            describe(bytes((GET_MODE, 1, mode)))
     assert describe(bytes((0x12, 1, 0))) is None
     assert adapter_for().read_report(bytes((GET_MODE, 1, 0))) is None  # not running: nothing to it
     assert device.violations == []

@@ -17,7 +17,7 @@ import pytest
 from bridged import bridge as bridge_module
 from bridged.bridge import Bridge
 from bridged.config import load
-from bridged.lifecycle import State
+from bridged.lifecycle import Event, State
 from bridged.memory import FileMemory
 from bridged.service import serve
 from bridged.simulators.can232 import Can232
@@ -77,12 +77,14 @@ class Bench:
             self._thread.join()
             self._simulator = None
 
-    def bridge(self, channel: str = "bitrate: 125000", transmit: str = "{}", **adapter: object) -> Bridge:
+    def bridge(
+        self, channel: str = "bitrate: 125000", transmit: str = "{}", more: str = "", **adapter: object
+    ) -> Bridge:
         path = self.folder / "bench.yaml"
         options = "".join(f", {key}: {value}" for key, value in adapter.items())
         path.write_text(
             f"adapter: {{type: can232, port: {self.link}, baudrate: 115200{options}}}\n"
-            f"channel: {{{channel}}}\nbus: {{channel: vcan0}}\ntransmit: {transmit}\n".replace(
+            f"channel: {{{channel}}}\nbus: {{channel: vcan0}}\n{more}\ntransmit: {transmit}\n".replace(
                 "transmit: {}\n", ""
             )
         )
@@ -233,14 +235,14 @@ def test_stop_in_the_middle_of_initialisation_leaves_it_closed(
     bench.plug_in(Can232(time.monotonic()))
     bridge = bench.bridge()
     asked = 0
-    ask = bridge._ask
+    ask = bridge._exchanges.ask
 
     def counting(*args: Any) -> None:
         nonlocal asked
         asked += 1
         ask(*args)
 
-    monkeypatch.setattr(bridge, "_ask", counting)
+    monkeypatch.setattr(bridge._exchanges, "ask", counting)
     bridge.start()
     run_until(bridge, lambda: asked >= after or bridge.state is State.RUNNING)
     stopped(bridge)
@@ -287,6 +289,68 @@ def test_pulled_out_and_plugged_in_again(bench: Bench) -> None:
     run_until(bridge, lambda: bridge.state is State.RUNNING)
     stopped(bridge)
     assert bench.frames == []
+
+
+def test_plugged_in_late_and_told_at_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    """The event is the kernel's for a tty; the pause alone would last a minute."""
+    bridge = bench.bridge(more="reconnect: {initial: 60, maximum: 60}")
+    looking = bridge._watch
+    looking.close()
+    kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ours.setblocking(False)
+    looking._socket, looking.fd = ours, ours.fileno()
+    with kernel, caplog.at_level(logging.INFO):
+        started(bridge, State.WAITING)
+        assert bridge.snapshot()["reason"].startswith(f"{bench.link}: does not exist; serial adapters here:")
+        kernel.send(b"add@/x\0ACTION=add\0SUBSYSTEM=tty\0DEVNAME=ttyUSB77\0")  # another one
+        bench.plug_in(Can232(time.monotonic()))
+        run_until(bridge, lambda: not select.select([ours], (), (), 0)[0])
+        assert bridge.state is State.WAITING
+        name = bench.link.resolve().name
+        kernel.send(f"add@/x\0ACTION=add\0SUBSYSTEM=tty\0DEVNAME={name}\0".encode())
+        run_until(bridge, lambda: bridge.state is State.RUNNING)
+        stopped(bridge)
+    lines = [
+        record.getMessage().partition(":")[0] for record in caplog.records if record.name == "bridged.bridge"
+    ]
+    assert [line for line in lines if "state=" in line] == [
+        "state=opening",
+        "state=waiting",
+        "state=running",
+        "state=stopping",
+        "state=stopped",
+    ]
+
+
+def test_what_has_no_events_is_found_by_looking(bench: Bench) -> None:
+    bridge = bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.05}")
+    bridge._watch._set_membership = lambda _option: None  # type: ignore[method-assign]
+    started(bridge, State.WAITING)
+    bench.plug_in(Can232(time.monotonic()))
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    bench.pull_out()
+    run_until(bridge, lambda: bridge.state is State.WAITING)
+    stopped(bridge)
+
+
+def test_the_same_failure_is_told_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    device = Can232(time.monotonic())
+    device.silent = True
+    bench.plug_in(device)
+    bridge = bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.02}")
+    failures = 0
+    dispatch = bridge._dispatch
+
+    def counting(event: Event, reason: str = "") -> None:
+        nonlocal failures
+        failures += event is Event.UNANSWERED
+        dispatch(event, reason)
+
+    bridge._exchanges._dispatch = counting
+    bridge.start()
+    run_until(bridge, lambda: failures == 3)
+    stopped(bridge)
+    assert sum("no answer to V" in record.getMessage() for record in caplog.records) == 1
 
 
 def test_refused_frames_are_explained_and_sent_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:

@@ -16,7 +16,15 @@ import pytest
 
 from bridged import config
 from bridged.can import AcceptanceFilter, BitTiming
-from bridged.config import BusConfig, Can232Config, ChannelConfig, TransmitConfig, Usb2canConfig, load
+from bridged.config import (
+    BusConfig,
+    Can232Config,
+    ChannelConfig,
+    ReconnectConfig,
+    TransmitConfig,
+    Usb2canConfig,
+    load,
+)
 from bridged.errors import ConfigError
 from bridged.yaml_source import key_names
 
@@ -92,6 +100,10 @@ def bus(keys: str) -> str:
 
 def transmit(keys: str) -> str:
     return four_lines(more=f"transmit: {{{keys}}}")
+
+
+def reconnect(keys: str) -> str:
+    return four_lines(more=f"reconnect: {{{keys}}}")
 
 
 def problems_of(file: Path, content: str | bytes) -> list[str]:
@@ -189,6 +201,7 @@ def test_the_examples_show_every_key_and_the_defaults(file: Path, type_: str) ->
     file.write_text(four_lines(f"{{type: {type_}, port: /dev/ttyUSB0}}"))
     defaults = load(file)
     assert (shown.adapter, shown.transmit) == (defaults.adapter, defaults.transmit)
+    assert (shown.health, shown.reconnect) == (defaults.health, defaults.reconnect)
 
 
 @needs_calculator
@@ -243,6 +256,9 @@ def test_what_an_example_has_in_comments_is_right_too(file: Path, example: Path)
         (transmit("deadline: 1"), "transmit.deadline_s", 1.0),
         (transmit("deadline: 3600, window: 32"), "transmit.window", 32),
         (transmit(""), "transmit.queue", 1024),
+        (four_lines(), "reconnect.maximum_s", 5.0),
+        (reconnect("maximum: 0.1"), "reconnect", ReconnectConfig(initial_s=0.1, maximum_s=0.1)),
+        (reconnect("initial: 0.01, maximum: 3600"), "reconnect", ReconnectConfig(initial_s=0.01, maximum_s=3600.0)),
         ("\ufeff" + four_lines(), "name", "test"),
         (four_lines().replace("\n", "\r\n"), "adapter.port", "/dev/ttyUSB0"),
         ("%YAML 1.1\n---\n" + four_lines(), "name", "test"),
@@ -281,6 +297,7 @@ REGISTER = "a register value from 0x00 to 0xFF is wanted"
 SAMPLE_POINT = "a fraction of the bit time from 0.5 to 0.95 is wanted"
 WORD = "a number from 0x00000000 to 0xFFFFFFFF is wanted"
 NAME = "the name of an interface has"
+PAUSE = "a number of seconds from 0.01 to 3600 is wanted"
 DEADLINE = "a number of seconds above 0 and up to 3600 is wanted"
 USB = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, is wanted, not"
 CRITICAL = "a number of frames from 2 to 18 is wanted"
@@ -374,6 +391,10 @@ SINGLE = "a single value, or a list of single values, is wanted"
         (transmit, "deadline: 1e-1", f"{DEADLINE}, not the text '1e-1' (write 0.1)"),
         (transmit, "deadline: 1e-9", f"{DEADLINE}, not the text '1e-9'"),
         (transmit, "deadline: 1:30.5", f"{DEADLINE}, not the text '1:30.5'"),
+        (reconnect, "maximum: 0", f"{PAUSE}, not 0"),
+        (reconnect, "initial: 3601", f"{PAUSE}, not 3601"),
+        (reconnect, "initial: 5.1", "initial (5.1 s) is more than maximum (5 s)"),
+        (reconnect, "initial: 2, maximum: 1", "initial (2 s) is more than maximum (1 s)"),
     ],
 )  # fmt: skip
 def test_one_wrong_value(file: Path, section: Callable[[str], str], entry: str, problem: str) -> None:
@@ -381,7 +402,7 @@ def test_one_wrong_value(file: Path, section: Callable[[str], str], entry: str, 
     text = section(entry)
     if section in (port, usb2can_port):
         entry = f"port: {entry}"
-    name = section.__name__ if section in (channel, bus, transmit) else "adapter"
+    name = section.__name__ if section in (channel, bus, transmit, reconnect) else "adapter"
     path = f"{name}.{entry.rpartition(', ')[2]}"
     key, value = path.split(": ", 1)
     line = next(number for number, line in enumerate(text.splitlines()) if entry in line)
@@ -432,14 +453,14 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "unknown": ("adapter:\n  type: can232\n  port: /dev/x\n  baud: 1\nchannel: {bitrate: 125000}\nbus: {channel: vcan0, loop: true}\ntransmitt: {}\n1: 2\n", [
         f"4:3: adapter.baud: unknown key, baudrate is probably meant; allowed here: {CAN232_KEYS}",
         f"6:23: bus.loop: unknown key; allowed here: {BUS_KEYS}",
-        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit, health",
-        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit, health",
+        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit, health, reconnect",
+        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit, health, reconnect",
     ]),
     "in the wrong section": ("adapter: {type: can232, port: /dev/x, bitrate: 1, channel: a}\nchannel: {bitrate: 125000, mask: 1}\nbus: {channel: vcan0}\nport: /dev/x\n", [
         f"1:39: adapter.bitrate: unknown key, it belongs to channel; allowed here: {CAN232_KEYS}",
         f"1:51: adapter.channel: unknown key, it belongs to bus; allowed here: {CAN232_KEYS}",
         f"2:28: channel.mask: unknown key, it belongs to channel.acceptance; allowed here: {CHANNEL_KEYS}",
-        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health",
+        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health, reconnect",
     ]),
     "hyphen, capitals": (channel("bitrate: 125000, listen-only: true, BTR0: 3"), [
         f"2:28: channel.listen-only: unknown key, listen_only is probably meant; allowed here: {CHANNEL_KEYS}",
@@ -466,7 +487,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "in the wrong section, of usb2can": ("adapter: {type: usb2can, port: /dev/x, btr0: 1, ready: 2}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\nready_limit: 3\n", [
         f"1:40: adapter.btr0: unknown key, it belongs to channel; allowed here: {USB2CAN_KEYS}",
         f"1:49: adapter.ready: unknown key, ready_limit is probably meant; allowed here: {USB2CAN_KEYS}",
-        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health",
+        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health, reconnect",
     ]),
     "of the other adapter": (adapter("ready_limit: 99, critical_limit: 15, critical_limit: ~"), [
         "1:39: adapter.ready_limit: goes with type: usb2can; remove it",

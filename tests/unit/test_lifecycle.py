@@ -1,25 +1,43 @@
-"""The lifecycle's table: every pair, and what must hold of all of them."""
+"""The lifecycle's table, pair by pair; what the log repeats; and the whole in simulated time."""
+
+from __future__ import annotations
 
 import itertools
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bridged.lifecycle import IGNORED, TABLE, Action, Backoff, Event, State, transition
+from bridged.lifecycle import (
+    IGNORED,
+    JITTER,
+    REPEAT_LOG_S,
+    STABLE_S,
+    TABLE,
+    TOLD_AT_MOST,
+    Action,
+    Backoff,
+    Event,
+    State,
+    Told,
+    transition,
+)
 
-# Events that a state can meet, and no others. RELEASE drops what the relay still had to say.
+# Events that a state can meet, and no others: RELEASE drops what the relay still had to say, a timer is set
+# in three states only, and nobody looks out for the device before the start.
+ALWAYS = {Event.STOP, Event.APPEARED}
 POSSIBLE = {
     State.IDLE: {Event.START, Event.STOP},
-    State.OPENING: {Event.OPENED, Event.OPEN_FAILED, Event.STOP},
-    State.INITIALISING: {Event.READY, Event.UNANSWERED, Event.REFUSED, Event.PORT_LOST, Event.STOP},
-    State.RUNNING: {Event.SILENT, Event.PORT_LOST, Event.STOP},
-    State.REJECTING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
-    State.CLOSING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
-    State.BACKOFF: {Event.TIMER, Event.PORT_LOST, Event.STOP},
-    State.FAULT: {Event.TIMER, Event.PORT_LOST, Event.STOP},
-    State.STOPPING: {Event.CLOSED, Event.SILENT, Event.PORT_LOST, Event.STOP},
-    State.STOPPED: {Event.OPENED, Event.OPEN_FAILED, Event.PORT_LOST, Event.STOP},
+    State.WAITING: ALWAYS | {Event.TIMER},
+    State.OPENING: ALWAYS | {Event.OPENED, Event.ABSENT, Event.OPEN_FAILED},
+    State.INITIALISING: ALWAYS | {Event.READY, Event.UNANSWERED, Event.REFUSED, Event.PORT_LOST},
+    State.RUNNING: ALWAYS | {Event.SILENT, Event.PORT_LOST},
+    State.REJECTING: ALWAYS | {Event.CLOSED, Event.SILENT, Event.PORT_LOST},
+    State.CLOSING: ALWAYS | {Event.CLOSED, Event.SILENT, Event.PORT_LOST},
+    State.BACKOFF: ALWAYS | {Event.TIMER, Event.PORT_LOST, Event.SILENT},
+    State.FAULT: ALWAYS | {Event.TIMER, Event.PORT_LOST, Event.SILENT},
+    State.STOPPING: ALWAYS | {Event.CLOSED, Event.SILENT, Event.PORT_LOST},
+    State.STOPPED: ALWAYS | {Event.OPENED, Event.ABSENT, Event.OPEN_FAILED, Event.PORT_LOST, Event.SILENT},
 }
 
 
@@ -40,34 +58,311 @@ def test_ignored_and_decided_do_not_overlap() -> None:
     assert not IGNORED & TABLE.keys()
 
 
-@given(st.data())
-def test_random_walks_keep_what_must_hold(data: st.DataObject) -> None:
-    state, port_open, gates_open, waiting = State.IDLE, False, False, False
-    for _ in range(60):
-        possible = POSSIBLE[state] - ({Event.TIMER} if not waiting else set())
-        if state is State.STOPPED and port_open:
-            possible -= {Event.OPENED}
-        event = data.draw(st.sampled_from(sorted(possible, key=lambda e: e.name)))
-        port_open = port_open or event is Event.OPENED
-        state, actions = transition(state, event)
-        waiting = waiting and not actions
+@pytest.mark.parametrize("state", [state for state in State if state is not State.STOPPED])
+def test_stop_leads_to_the_end(state: State) -> None:
+    after, actions = transition(state, Event.STOP)
+    if after is State.STOPPING:
+        for event in (Event.CLOSED, Event.PORT_LOST):
+            assert transition(after, event) == (State.STOPPED, (Action.RELEASE, Action.FINISH))
+    else:
+        assert (after, actions) == (State.STOPPED, (Action.FINISH,))
+
+
+# --- pauses -----------------------------------------------------------------------------------
+
+
+def test_pauses_double_to_their_maximum() -> None:
+    backoff = Backoff(0.1, 1.0, lambda: 0.0)
+    assert [backoff.next_s(0.0) for _ in range(5)] == [0.1, 0.2, 0.4, 0.8, 1.0]
+    backoff.hurry()
+    assert backoff.next_s(0.0) == 0.1
+    assert backoff.longest_s() == 1.0
+    assert backoff.next_s(0.0) == 0.2
+
+
+def test_pauses_differ_but_never_exceed_the_maximum() -> None:
+    random = iter([0.0, 0.5, 1.0])
+    backoff = Backoff(5.0, 5.0, lambda: next(random))
+    pauses = [backoff.next_s(0.0), backoff.next_s(0.0), backoff.longest_s()]
+    assert pauses == pytest.approx([5.0, 5.0 * (1 - JITTER / 2), 5.0 * (1 - JITTER)])
+
+
+@pytest.mark.parametrize(("ran_s", "pause_s"), [(STABLE_S - 0.1, 0.8), (STABLE_S, 0.1)])
+def test_only_a_stable_run_makes_pauses_short_again(ran_s: float, pause_s: float) -> None:
+    backoff = Backoff(0.1, 5.0, lambda: 0.0)
+    for _ in range(3):
+        backoff.next_s(1000.0)
+    backoff.runs(1000.0)
+    assert backoff.next_s(1000.0 + ran_s) == pause_s
+    assert backoff.next_s(5000.0) == 2 * pause_s  # it did not run since
+
+
+# --- what is told -----------------------------------------------------------------------------
+
+
+def test_a_cause_is_told_once_until_all_is_well_again() -> None:
+    told = Told()
+    assert (told.failing, told.quiet) == (False, False)
+    assert [told.tell("a", n) for n in range(3)] == [1, None, None]
+    assert told.tell("b", 3) == 1
+    assert (told.failing, told.quiet) == (True, False)
+    told.well()
+    assert (told.failing, told.quiet) == (False, True)
+    assert told.tell("a", 4) == 3
+    assert told.tell("a", 5) is None
+    assert not told.quiet
+
+
+def test_what_comes_and_goes_is_not_told_each_time() -> None:
+    told = Told()
+    times = []
+    for n in range(20):
+        times.append(told.tell("flaps", n))
+        told.well()
+    assert times == [1] * TOLD_AT_MOST + [None] * (20 - TOLD_AT_MOST)
+    assert told.tell("flaps", 20) is None
+    assert told.quiet  # so that its end is not told either
+
+
+def test_what_lasts_is_told_again_and_how_often_it_came() -> None:
+    told = Told()
+    times = [told.tell("silent", now) for now in range(0, 2 * int(REPEAT_LOG_S) + 1, 5)]
+    per_time = int(REPEAT_LOG_S) // 5
+    assert [n for n in times if n] == [1, per_time, per_time]
+
+
+def test_what_was_told_long_ago_is_forgotten() -> None:
+    told = Told()
+    for n in range(1000):
+        told.tell(f"process {n}", n * 100)
+    assert len(told._causes) <= 2 * REPEAT_LOG_S / 100 + 1
+
+
+# --- the whole, in simulated time -------------------------------------------------------------
+
+OPEN_S, STEP_S, SILENCE_S = 0.01, 0.05, 0.5
+INITIAL_S, MAXIMUM_S = 0.1, 5.0
+
+
+class World(RuleBasedStateMachine):
+    """A device that comes and goes, and a bridge that performs the actions as bridge.py does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+        self.state = State.IDLE
+        self.backoff = Backoff(INITIAL_S, MAXIMUM_S, lambda: self.jitter)
+        self.jitter = 0.0
+        # The world.
+        self.present, self.openable, self.answers, self.right = True, True, True, True
+        # The bridge: what is set to happen and when; only one of each.
+        self.timer: float | None = None
+        self.result: tuple[float, Event] | None = None  # of opening, initialising, closing
+        self.opening = self.port_open = self.gates_open = self.finished = self.looking_out = False
+        self.tries: list[float] = []
+        self.pushed = False
+        self.dispatch(Event.START)
+
+    # The bridge
+
+    def dispatch(self, event: Event) -> None:
+        assert event in POSSIBLE[self.state], (self.state, event)
+        self.state, actions = transition(self.state, event)
         for action in actions:
-            if action is Action.RUN:
-                gates_open = True
-            elif action in {Action.CLOSE, Action.RELEASE, Action.FINISH}:
-                gates_open = False
-            if action is Action.RELEASE:
-                port_open = False
-            if action is Action.OPEN:
-                assert not port_open
-            waiting = action in {Action.WAIT, Action.WAIT_LONG}
-        assert gates_open == (state is State.RUNNING)
-        assert not (state in {State.BACKOFF, State.FAULT, State.STOPPED} and port_open)
-        assert (state in {State.BACKOFF, State.FAULT}) == waiting or state is State.STOPPED
+            getattr(self, f"do_{action.name.lower()}")()
+
+    def do_look(self) -> None:
+        self.do_wait()
+        if self.present:
+            self.pushed = True
+            self.dispatch(Event.APPEARED)
+
+    def do_open(self) -> None:
+        assert not self.port_open
+        assert not self.opening
+        self.timer, self.looking_out, self.opening = None, False, True
+        # By itself it does not hammer; news of the device may have it try at once.
+        assert self.pushed or not self.tries or self.now - self.tries[-1] >= (1 - JITTER) * INITIAL_S
+        self.pushed = False
+        self.tries.append(self.now)
+        self.result = self.now + OPEN_S, Event.OPENED  # what came of it is seen then
+
+    def do_initialise(self) -> None:
+        assert self.port_open
+        self.result = self.now + STEP_S, Event.READY
+
+    def do_run(self) -> None:
+        self.gates_open = True
+        self.backoff.runs(self.now)
+
+    def do_close(self) -> None:
+        assert self.port_open
+        self.gates_open = False
+        self.result = self.now + STEP_S, Event.CLOSED
+
+    def do_release(self) -> None:
+        self.port_open = self.gates_open = False
+        self.result = None
+
+    def do_wait(self) -> None:
+        self.set_timer(self.backoff.next_s(self.now))
+
+    def do_wait_long(self) -> None:
+        self.set_timer(self.backoff.longest_s())
+
+    def do_hurry(self) -> None:
+        self.backoff.hurry()
+
+    def do_finish(self) -> None:
+        assert not self.port_open
+        self.finished, self.looking_out, self.timer = True, False, None
+
+    def set_timer(self, seconds: float) -> None:
+        assert self.timer is None, "two timers"
+        assert (1 - JITTER) * INITIAL_S <= seconds <= MAXIMUM_S
+        self.timer, self.looking_out = self.now + seconds, True
+
+    # What happens to it
+
+    def finish_opening(self) -> None:
+        self.opening = False
+        self.result = None
+        if not self.present:
+            self.dispatch(Event.ABSENT)
+        elif not self.openable:
+            self.dispatch(Event.OPEN_FAILED)
+        else:
+            self.port_open = True
+            self.dispatch(Event.OPENED)
+
+    def finish_steps(self, event: Event) -> None:
+        self.result = None
+        if event is Event.READY and not self.answers:
+            event = Event.UNANSWERED
+        elif event is Event.READY and not self.right:
+            event = Event.REFUSED
+        self.dispatch(event)
+
+    def step(self, end: float) -> None:
+        """To the next thing that is due, or to the end."""
+        due = [at for at in (self.timer, self.result and self.result[0]) if at is not None and at <= end]
+        if not due:
+            if self.state is State.RUNNING and not self.answers and end - self.now >= SILENCE_S:
+                self.dispatch(Event.SILENT)
+            self.now = end
+            return
+        self.now = max(self.now, min(due))
+        if self.timer is not None and self.timer <= self.now:
+            self.timer = None
+            self.dispatch(Event.TIMER)
+        elif self.result is not None:
+            if self.opening:
+                self.finish_opening()
+            else:
+                self.finish_steps(self.result[1])
+
+    def pass_time(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.now < end:
+            self.step(end)
+
+    @rule(seconds=st.sampled_from([0.001, 0.02, 0.1, 0.7, 3.0, 70.0]), jitter=st.floats(0, 1))
+    def time_passes(self, seconds: float, jitter: float) -> None:
+        self.jitter = jitter
+        self.pass_time(seconds)
+
+    @rule()
+    @precondition(lambda self: self.present)
+    def pull_out(self) -> None:
+        self.present = False
+        if self.port_open:
+            self.dispatch(Event.PORT_LOST)
+
+    @rule(openable=st.booleans(), right=st.booleans())
+    @precondition(lambda self: not self.present)
+    def plug_in(self, openable: bool, right: bool) -> None:
+        """Perhaps another device, or one that udev has not seen to yet."""
+        self.present, self.openable, self.right = True, openable, right
+        if self.looking_out:
+            self.pushed = True
+            self.dispatch(Event.APPEARED)
+            assert self.opening, "at once"
+
+    @rule()
+    @precondition(lambda self: not self.openable and self.present)
+    def udev_is_done(self) -> None:
+        self.openable = True
+        if self.looking_out:
+            self.pushed = True
+            self.dispatch(Event.APPEARED)
+
+    @rule()
+    def fall_silent_or_speak(self) -> None:
+        self.answers = not self.answers
+
+    @rule()
+    @precondition(lambda self: self.state is State.RUNNING)
+    def reset_behind_our_back(self) -> None:
+        self.dispatch(Event.SILENT)
+
+    @rule(late=st.sampled_from([Event.APPEARED, Event.STOP]))
+    @precondition(lambda self: self.state in {State.STOPPING, State.STOPPED})
+    def late_news(self, late: Event) -> None:
+        self.dispatch(late)
+
+    @rule()
+    @precondition(lambda self: self.state not in {State.STOPPING, State.STOPPED})
+    def stop(self) -> None:
+        self.dispatch(Event.STOP)
+
+    # What must hold
+
+    @invariant()
+    def one_thing_at_a_time(self) -> None:
+        pausing = self.state in {State.WAITING, State.BACKOFF, State.FAULT}
+        assert (self.timer is not None) == pausing == self.looking_out
+        assert self.gates_open == (self.state is State.RUNNING)
+        assert self.opening == (self.state is State.OPENING) or self.finished
+        closed = {State.IDLE, State.OPENING, State.WAITING, State.BACKOFF, State.FAULT}
+        assert not (self.state in closed and self.port_open)
+        assert self.finished == (self.state is State.STOPPED)
+
+    def teardown(self) -> None:
+        """Whatever happened: with a good device it runs within the longest pause, and it can be stopped."""
+        if not self.finished and self.state is not State.STOPPING:
+            self.present = self.openable = self.answers = self.right = True
+            self.pass_time(MAXIMUM_S + 2 * (OPEN_S + 2 * STEP_S))
+            assert self.state is State.RUNNING, self.state
+            self.dispatch(Event.STOP)
+        self.pass_time(1.0)
+        assert self.finished
 
 
-def test_backoff_doubles_to_its_maximum_and_starts_again() -> None:
-    backoff = Backoff(0.1, 1.0)
-    assert [backoff.next_s() for _ in range(5)] == [0.1, 0.2, 0.4, 0.8, 1.0]
-    backoff.reset()
-    assert backoff.next_s() == 0.1
+TestWorld = World.TestCase
+
+
+def test_a_device_that_is_away_is_not_tried_at_all() -> None:
+    """An hour without it costs no try and few looks; one that does not answer, a try every five seconds."""
+    world = World()
+    world.pass_time(10.0)
+    assert world.state is State.RUNNING
+    world.pull_out()
+    world.pass_time(3600.0)
+    assert (world.state, len(world.tries)) == (State.WAITING, 2)
+    world.plug_in(openable=True, right=True)
+    world.answers = False
+    world.pass_time(3600.0)
+    assert 700 < len(world.tries) < 750
+
+
+def test_a_device_whose_permissions_come_late_is_tried_quickly() -> None:
+    world = World()
+    world.pull_out()
+    world.pass_time(100.0)
+    world.plug_in(openable=False, right=True)
+    before = len(world.tries)
+    world.pass_time(0.5)
+    assert len(world.tries) - before >= 2
+    world.openable = True
+    world.pass_time(1.0)
+    assert world.state is State.RUNNING

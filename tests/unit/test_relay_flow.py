@@ -1,189 +1,14 @@
 """The window of a USB2CAN, against the simulated device behind a latency, on a clock of the test's own."""
 
-import contextlib
-import math
-import socket
-import struct
-from collections import Counter, defaultdict, deque
-from collections.abc import Iterator
+from collections import Counter, defaultdict
 from typing import Any
 
 import pytest
+from flow_rig import STOP, US, S, assert_in_order, numbered, packed, rig_with
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridged import _relay
-from bridged.adapters.base import Answer, Reply, Steps
-from bridged.adapters.usb2can import Usb2can as Adapter
-from bridged.can import BitTiming
-from bridged.config import ChannelConfig, Usb2canConfig
-from bridged.simulators.sja1000 import Frame
-from bridged.simulators.usb2can import Usb2can
-
-US, MS, S = 1_000, 1_000_000, 1_000_000_000
-FRAME = struct.Struct("=IB3x8s")
-EFF, RTR = 0x80000000, 0x40000000
-LATENCY_NS = 700 * US  # each way: USB
-STEP_NS = 125 * US
-STOP = bytes.fromhex("0F 09 02 02 01")
-
-
-def packed(frame: Frame) -> bytes:
-    flags = EFF * frame.extended | RTR * frame.remote
-    return FRAME.pack(frame.can_id | flags, frame.dlc, frame.data)
-
-
-def numbered(number: int, can_id: int | None = None) -> Frame:
-    """A frame that carries its number."""
-    return Frame(number % 0x800 if can_id is None else can_id, False, False, 8, number.to_bytes(8))
-
-
-class Rig:
-    """A relay and a simulated USB2CAN, initialised, on one clock; `run` lets both live on."""
-
-    def __init__(
-        self, *, bitrate: int = 1_000_000, window: int = 16, deadline: float = 60.0, **device: Any
-    ) -> None:
-        self.now = S
-        stop_grace_s = (
-            3 * (LATENCY_NS + STEP_NS) / S
-        )  # a stop takes its time to the host, frames to the device
-        self.device = Usb2can(1.0, stop_grace_s=stop_grace_s, **device)
-        adapter = Usb2canConfig(type="usb2can", port="/dev/sim")
-        self.adapter = Adapter(adapter, ChannelConfig(timing=BitTiming(bitrate)))
-        self.relay = _relay.Relay(
-            "usb2can",
-            queue=4096,
-            window=window,
-            deadline=deadline,
-            answer_timeout=self.adapter.answer_timeout_s,
-            sync=self.adapter.sync.request,
-            sync_prefix=self.adapter.sync.prefix,
-        )
-        self.port, self._near_port = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.bus, self._near_bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        for s in (self.port, self._near_port, self.bus, self._near_bus):
-            s.setblocking(False)
-        self._down: deque[tuple[int, bytes]] = deque()  # to the device: when it arrives
-        self._up: deque[tuple[int, bytes]] = deque()
-        self._relay_next: int | None = None
-        self.corrupt = False  # what the device says next loses a byte
-        self.sent: list[Frame] = []  # by the device, on its bus
-        self.received: list[bytes] = []  # from the relay, on the host's bus
-        self.events: list[tuple[int, int, bytes]] = []
-        self.relay.attach_bus(self._near_bus)
-        self.relay.attach_port(self._near_port)
-        self.perform(self.adapter.init_steps(None))
-        self.open()
-
-    def open(self) -> None:
-        flow = self.adapter.flow
-        assert flow is not None
-        self.relay.set_flow(
-            flow.request, flow.prefix, capacity=flow.capacity, critical=flow.critical, ready=flow.ready
-        )
-        self.relay.set_gates(receiving=True, transmit=_relay.GATE_OPEN)
-
-    def perform(self, steps: Steps) -> None:
-        """What bridge.py does with them."""
-        accept = {Reply.OK: _relay.ACCEPT_OK, Reply.REFUSED: _relay.ACCEPT_REFUSED}
-        answer: Answer | None = None
-        while True:
-            try:
-                exchange = steps.send(answer) if answer else next(steps)
-            except StopIteration:
-                return
-            accepted = sum(accept.get(reply, 0) for reply in set(exchange.accept + exchange.reject))
-            self.relay.command(1, exchange.request, accepted, exchange.prefix, exchange.timeout_s)
-            answer = None
-            while answer is None:
-                self.run(0.000125)
-                for kind, token, text in self.take_events():
-                    if token == 1 and kind in {_relay.EVENT_TEXT, _relay.EVENT_TIMEOUT}:
-                        answer = Answer(Reply.TEXT if kind == _relay.EVENT_TEXT else Reply.NONE, text)
-            assert answer.reply in exchange.accept
-
-    def run(self, seconds: float) -> None:
-        end = self.now + round(seconds * S)
-        while self.now < end:
-            self.now = min(end, max(self.now + STEP_NS, self._next()))
-            self._step()
-
-    def _next(self) -> int:
-        """When something happens that nobody has to be told of."""
-        device = self.device.next_deadline()
-        times = [self._relay_next, *(pipe[0][0] for pipe in (self._up, self._down) if pipe)]
-        times.append(math.ceil(device * S) if device < math.inf else None)
-        return min((time for time in times if time is not None), default=1 << 62)
-
-    def run_until_done(self, limit_s: float = 60.0) -> dict[str, int]:
-        """Until nothing is queued and the device has sent everything."""
-        end = self.now + round(limit_s * S)
-        while self.relay.counters()["queued"] or self.device.report()["waiting"]:  # type: ignore[index]
-            assert self.now < end, (self.counters(), self.device.report())
-            self.run(0.001)
-        self.run(0.01)
-        return self.counters()
-
-    def _step(self) -> None:
-        now_s = self.now / S
-        while self._up and self._up[0][0] <= self.now:
-            self.port.send(self._up.popleft()[1])
-        self._relay_next = self.relay.turn(self.now)
-        with contextlib.suppress(BlockingIOError):
-            self._down.append((self.now + LATENCY_NS, self.port.recv(1 << 16)))
-        while self._down and self._down[0][0] <= self.now:
-            self.device.host_writes(now_s, self._down.popleft()[1])
-        if output := self.device.take_output(now_s):
-            if self.corrupt:
-                self.corrupt = False
-                output = output[:1] + output[2:]
-            self._up.append((self.now + LATENCY_NS, output))
-        self.sent += self.device.take_bus_frames()
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                self.received.append(self.bus.recv(128))
-        self.events += self.relay.events()
-
-    def take_events(self) -> list[tuple[int, int, bytes]]:
-        events, self.events = self.events, []
-        return events
-
-    def send(self, *frames: Frame) -> None:
-        for frame in frames:
-            self.bus.send(packed(frame))
-            self._relay_next = self.relay.turn(self.now)
-
-    def counters(self) -> dict[str, int]:
-        """The counters, flat, with the books checked."""
-        c = self.relay.counters()
-        tx, rx = c.pop("tx_dropped"), c.pop("rx_dropped")
-        assert isinstance(tx, dict)
-        assert isinstance(rx, dict)
-        assert c["bus_read"] == c["tx_frames"] + c["queued"] + sum(tx.values())
-        assert c["decoded"] == c["rx_frames"] + c["rx_pending"] + sum(rx.values())
-        return {**c, **tx, "tx_dropped": sum(tx.values())}  # type: ignore[dict-item]
-
-    def close(self) -> None:
-        for s in (self.port, self._near_port, self.bus, self._near_bus):
-            s.close()
-        assert self.device.violations == []
-
-
-@contextlib.contextmanager
-def rig_with(**options: Any) -> Iterator[Rig]:
-    rig = Rig(**options)
-    try:
-        yield rig
-    finally:
-        rig.close()
-
-
-def assert_in_order(rig: Rig, frames: list[Frame]) -> None:
-    assert rig.sent == frames, next(
-        (i, a, b) for i, (a, b) in enumerate(zip(rig.sent, frames, strict=False)) if a != b
-    )
-
 
 FIRMWARE = pytest.mark.parametrize(
     "device",
@@ -377,6 +202,89 @@ def test_full_bus_both_ways() -> None:
         rig.run_until_done()
         assert_in_order(rig, down)
         assert rig.received == [packed(frame) for frame in up]
+
+
+@pytest.mark.parametrize("lost", range(5, 14))
+def test_a_frame_handed_back_and_damaged_on_the_way_is_not_taken_for_sent(lost: int) -> None:
+    """The codec mends what follows, so that nothing is skipped; only the frame is none of ours."""
+    with rig_with() as rig:
+        rig.send(numbered(0))
+        rig.run_until_done()
+        rig.device.refusals = 1
+        rig.damage = (bytes.fromhex("0F 09 0C 00"), lost)
+        rig.send(numbered(1))
+        c = rig.run_until_done()
+        assert (c["tx_frames"], c["unanswered"], c["tx_dropped"]) == (1, 1, 1)
+        assert rig.sent == [numbered(0)]
+
+
+def test_of_equal_frames_the_newest_is_handed_back() -> None:
+    with rig_with(tx_buffer=2, bitrate=10_000) as rig:
+        on, off = numbered(1, 0x100), numbered(0, 0x100)
+        rig.send(numbered(7))
+        rig.run_until_done()
+        for frame in (on, off, on):
+            rig.bus.send(packed(frame))
+        rig.turn()
+        rig.run_until_done()
+        assert rig.sent == [numbered(7), on, off, on]
+        assert rig.counters()["tx_returned"] >= 1
+
+
+def test_no_order_is_reversed_across_a_reconnect() -> None:
+    """What may have been taken before the port went is not followed by what was handed back before it."""
+    with rig_with() as rig:
+        rig.send(numbered(0))
+        rig.run_until_done()
+        rig.device.drop_answers = 1
+        rig.send(numbered(1, 0x200))
+        rig.device.refusals = 1
+        rig.run(0.002)
+        first, second = numbered(2, 0x100), numbered(3, 0x100)
+        rig.device.refusals = 1
+        rig.send(first, second)
+        rig.run(0.01)
+        rig.relay.detach_port()
+        rig.relay.attach_port(rig._near_port)
+        rig.open()
+        rig.run_until_done(3.0)
+        ids = [frame.data for frame in rig.sent if frame.can_id == 0x100]
+        assert ids == sorted(ids)
+
+
+def test_frames_that_do_not_leave_the_device_are_noticed() -> None:
+    """They would be sent whenever the bus lets them, however old."""
+    with rig_with(deadline=0.5) as rig:
+        rig.device.set_bus_off(rig.now / S, True)
+        rig.send(*(numbered(n) for n in range(3)))
+        rig.run(0.4)
+        assert _relay.EVENT_STUCK not in [kind for kind, _, _ in rig.events]
+        rig.run(0.4)
+        assert [(kind, token) for kind, token, _ in rig.events if kind == _relay.EVENT_STUCK] == [
+            (_relay.EVENT_STUCK, 3)
+        ]
+        rig.run(5.0)
+        assert [kind for kind, _, _ in rig.events].count(_relay.EVENT_STUCK) == 1
+
+
+def test_frames_that_leave_slowly_are_not_stuck() -> None:
+    with rig_with(deadline=0.5, bitrate=10_000) as rig:
+        for n in range(60):
+            rig.send(numbered(n))
+            rig.run(0.015)
+        rig.run_until_done()
+        assert _relay.EVENT_STUCK not in [kind for kind, _, _ in rig.events]
+        rig.run(0.2)
+        assert rig.relay.turn(rig.now) is None  # and nothing is asked any more
+
+
+def test_a_stop_said_again_and_again_ends() -> None:
+    with rig_with(answers_get=False) as rig:
+        rig.send(numbered(1))
+        for _ in range(20):
+            rig.device.garbage(rig.now / S, STOP)
+            rig.run(0.1)
+        assert rig.sent == [numbered(1)]
 
 
 FAULTS = st.sampled_from(

@@ -1,0 +1,97 @@
+"""Questions to the adapter of one bridge and their answers: one by one, or as the steps of a procedure."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+from bridged import _relay
+from bridged.adapters.base import Answer, Reply
+from bridged.errors import AdapterError, WrongDeviceError
+from bridged.lifecycle import Event
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bridged.adapters.base import Exchange, Steps
+
+REPLIES = {
+    _relay.EVENT_OK: Reply.OK,
+    _relay.EVENT_REFUSED: Reply.REFUSED,
+    _relay.EVENT_TEXT: Reply.TEXT,
+    _relay.EVENT_TIMEOUT: Reply.NONE,
+}
+ACCEPT = {Reply.OK: _relay.ACCEPT_OK, Reply.REFUSED: _relay.ACCEPT_REFUSED}
+
+
+class Exchanges:
+    """Sends them by the relay; the owner hands it the relay's events with a kind in REPLIES.
+
+    `dispatch` is told how a procedure ended: the event that it was to end with, REFUSED or UNANSWERED.
+    """
+
+    def __init__(self, relay: _relay.Relay, dispatch: Callable[[Event, str], None]) -> None:
+        self._relay = relay
+        self._dispatch = dispatch
+        self._tokens = itertools.count(1)
+        self._pending: dict[int, Callable[[Answer], None]] = {}
+        self._steps: Steps | None = None
+        self._end = Event.CLOSED
+
+    @property
+    def running(self) -> bool:
+        """Whether a procedure is under way."""
+        return self._steps is not None
+
+    def ask(self, exchange: Exchange, then: Callable[[Answer], None]) -> None:
+        token = next(self._tokens) & 0xFFFFFFFF
+        self._pending[token] = then
+        replies = exchange.accept + exchange.reject
+        accept = sum(ACCEPT.get(reply, 0) for reply in set(replies))
+        self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s)
+
+    def run(self, steps: Steps, end: Event) -> None:
+        """Performs them one after the other; a step that was under way is forgotten, its answer awaited."""
+        self._pending.clear()
+        self._steps = steps
+        self._end = end
+        self._advance(None)
+
+    def answer(self, kind: int, token: int, text: bytes) -> None:
+        """An event of the relay; nothing happens if nobody waits for it any more."""
+        then = self._pending.pop(token, None)
+        if then is not None:
+            then(Answer(REPLIES[kind], text))
+
+    def forget(self) -> None:
+        """Nobody waits for anything any more."""
+        self._steps = None
+        self._pending.clear()
+
+    def _advance(self, answer: Answer | None) -> None:
+        steps = self._steps
+        assert steps is not None
+        try:
+            exchange = steps.send(answer) if answer else next(steps)
+        except StopIteration:
+            self._steps = None
+            self._dispatch(self._end, "")
+        except WrongDeviceError as error:
+            self._dispatch(Event.REFUSED, str(error))
+        except AdapterError as error:
+            self._dispatch(Event.UNANSWERED, str(error))
+        else:
+            self.ask(exchange, lambda reply: self._on_step_answer(exchange, reply))
+
+    def _on_step_answer(self, exchange: Exchange, answer: Answer) -> None:
+        if answer.reply in exchange.accept:
+            self._advance(answer)
+            return
+        advice = f": {exchange.advice}" if exchange.advice else ""
+        if answer.reply is Reply.REFUSED:
+            self._dispatch(Event.REFUSED, f"the adapter refused to {exchange.purpose}{advice}")
+        else:
+            wait = f"within {exchange.timeout_s:.2g} s"
+            self._dispatch(
+                Event.UNANSWERED, f"the adapter did not answer the request to {exchange.purpose} {wait}"
+            )

@@ -1,0 +1,200 @@
+"""The bus's end of a bridge: lost, not to be had, down, up again; and what the log says of it."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+from test_bridge import PairBus
+
+from bridged import bus_end
+from bridged.bus_end import RETRY_S, BusEnd
+from bridged.buses import socketcan
+from bridged.config import load
+from bridged.errors import BusError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from bridged import _relay
+
+FRAME = bytes(16)
+DOWN = "interface vcan0 is down: ip link set vcan0 up"
+
+
+class Relay:
+    """What a BusEnd wants of one."""
+
+    def __init__(self) -> None:
+        self.bus = -1
+
+    def attach_bus(self, fd: int) -> None:
+        self.bus = fd
+
+    def detach_bus(self) -> None:
+        self.bus = -1
+
+
+class LosingBus(PairBus):
+    warning = ""
+
+    def __init__(self, warning: str = "") -> None:
+        super().__init__()
+        self.warning = warning
+
+    def dropped(self) -> dict[str, int]:
+        return {"socket-overflow": 3}
+
+
+class Bench:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        file = folder / "x.yaml"
+        file.write_text(
+            "adapter: {type: can232, port: /dev/x}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\n"
+        )
+        self.now, self.up = 1000.0, False
+        self.relay = Relay()
+        self.buses: list[LosingBus] = []
+        self.error: BusError | None = None
+        self.warning = ""
+        self.end = BusEnd(load(file), cast("_relay.Relay", self.relay), self.open)
+        monkeypatch.setattr(bus_end, "time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(socketcan, "is_up", lambda _channel: self.up)
+
+    def open(self) -> LosingBus:
+        if self.error:
+            raise self.error
+        self.buses.append(LosingBus(self.warning))
+        return self.buses[-1]
+
+    def pass_time(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.end.next_at is not None and self.end.next_at <= end:
+            self.now = max(self.now, self.end.next_at)
+            self.end.on_timer(self.now)
+        self.now = end
+
+
+@pytest.fixture
+def bench(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> Iterator[Bench]:
+    caplog.set_level(logging.INFO)
+    made = Bench(tmp_path, monkeypatch)
+    yield made
+    made.end.close()
+    for bus in made.buses:
+        bus.close()
+        bus.far.close()
+
+
+def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
+    found = [record.getMessage() for record in caplog.records]
+    caplog.clear()
+    return found
+
+
+def test_lost_and_opened_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    end = bench.end
+    end.open()
+    assert (bench.relay.bus, end.next_at) == (bench.buses[0].fd, None)
+    bench.error = BusError("vcan0: there is no such interface")
+    end.on_lost(errno.ENODEV)
+    end.on_lost(errno.ENODEV)  # late news
+    bench.pass_time(100.0)
+    assert (end.bus, end.reason, bench.relay.bus) == (
+        None,
+        "bus not open: vcan0: there is no such interface",
+        -1,
+    )
+    assert lines(caplog) == [
+        "bus open: pair",
+        "bus lost: pair: No such device (was vcan0 deleted?); opening it again",
+        "bus not open: vcan0: there is no such interface",
+    ]
+    bench.error = None
+    bench.pass_time(RETRY_S)
+    assert (end.bus, end.reason, end.next_at) == (bench.buses[1], "", None)
+    assert end.lost_frames() == {"socket-overflow": 6}
+    assert lines(caplog) == ["bus open: pair"]
+
+
+def test_down_and_up_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    end = bench.end
+    end.open()
+    end.on_down()
+    end.on_down()
+    bench.pass_time(3600.0)
+    assert end.reason == DOWN
+    bench.up = True
+    bench.pass_time(RETRY_S)
+    assert (end.reason, end.next_at, len(bench.buses)) == ("", None, 1)
+    assert lines(caplog) == ["bus open: pair", DOWN, "interface vcan0 is up again"]
+
+
+def test_down_from_the_start(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    bench.warning = "vcan0 is down: ip link set vcan0 up"
+    bench.end.open()
+    bench.end.on_down()  # the kernel says it, too
+    bench.up = True
+    bench.pass_time(2 * RETRY_S)
+    assert lines(caplog) == ["bus open: pair", bench.warning, "interface vcan0 is up again"]
+
+
+def test_deleted_while_down(bench: Bench) -> None:
+    bench.end.open()
+    bench.end.on_down()
+    bench.end.on_lost(errno.ENODEV)
+    bench.pass_time(0.0)
+    assert (bench.end.bus, bench.end.reason) == (bench.buses[1], "")
+
+
+def test_what_comes_and_goes_all_the_time_fills_no_log(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.up = True
+    bench.end.open()
+    for _ in range(1000):
+        bench.end.on_down()
+        bench.pass_time(2.0)
+        bench.end.on_lost(errno.ENODEV)
+        bench.pass_time(1.0)
+    assert len(lines(caplog)) < 30
+
+
+def test_error_frames_are_counted(bench: Bench) -> None:
+    end = bench.end
+    end.put_error_frame(FRAME)  # no bus
+    end.open()
+    end.put_error_frame(FRAME)
+    assert bench.buses[0].far.recv(64) == FRAME
+    bench.buses[0].far.close()
+    end.put_error_frame(FRAME)
+    assert end.error_frames == {"error_frames": 1, "error_frames_lost": 1}
+
+
+def test_handed_over(bench: Bench) -> None:
+    bench.end.open()
+    bus: Any = bench.end.hand_over()
+    assert (bus, bench.end.bus, bench.relay.bus) == (bench.buses[0], None, -1)
+    assert bench.end.hand_over() is None
+    bench.end.use(bus)
+    assert bench.relay.bus == bus.fd
+    bench.end.on_down()
+    assert bench.end.hand_over() is None
+    assert bench.end.bus is bus
+
+
+def test_is_up() -> None:
+    interfaces = Path("/sys/class/net")
+    names = os.listdir(interfaces) if interfaces.exists() else []  # noqa: PTH208 - names are wanted
+    for name in names:
+        if (interfaces / name / "flags").exists():
+            flags = int((interfaces / name / "flags").read_text(), 16)
+            assert socketcan.is_up(name) == bool(flags & 1)
+    assert not socketcan.is_up("no-such-one")

@@ -1,0 +1,404 @@
+"""The process: signals, reload, what systemd is told. systemd itself is in tests/system/test_systemd.py."""
+
+import json
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from bridged import journal, notify, service
+from bridged.bridge import Bridge
+from bridged.config import load
+from bridged.errors import ConfigError
+from bridged.lifecycle import State
+from bridged.memory import FileMemory
+from bridged.notify import Notifier
+from bridged.service import Service
+
+DEADLINE_S = 20.0
+RUNNING = "running: USB2CAN HW0003FW0016 RIG0001 on /dev/ttyUSB0, vcan0"
+CONFIG = """\
+adapter: {{type: can232, port: {port}, baudrate: 115200}}
+channel: {{bitrate: 125000}}
+bus: {{interface: virtual, channel: {bus}}}
+transmit: {{deadline: {deadline}}}
+"""
+# As systemd-python's; its own would do, but need not be installed.
+DAEMON = """\
+import os, socket
+def notify(text):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+        out.sendto(text.encode(), os.environ["NOTIFY_SOCKET"])
+"""
+
+
+def write_config(path: Path, *, port: str = "/nowhere/tty", bus: str = "a", deadline: float = 1.0) -> Path:
+    path.write_text(CONFIG.format(port=port, bus=bus, deadline=deadline))
+    return path
+
+
+class Systemd:
+    """What systemd hears."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / "notify"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.settimeout(DEADLINE_S)
+        self._socket.bind(str(self.path))
+
+    def hear(self) -> str:
+        """The next message but for the watchdog's."""
+        while (text := self._socket.recv(4096).decode()) == "WATCHDOG=1":
+            pass
+        return text
+
+    def wait_for(self, start: str) -> list[str]:
+        """All messages up to the one that begins like this, that one included."""
+        heard = [self._socket.recv(4096).decode()]
+        while not heard[-1].startswith(start):
+            heard.append(self._socket.recv(4096).decode())
+        return heard
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def systemd(tmp_path: Path) -> Iterator[Systemd]:
+    made = Systemd(tmp_path)
+    yield made
+    made.close()
+
+
+class TestProcess:
+    """`can-bridge run` as systemd starts it, without an adapter."""
+
+    @pytest.fixture
+    def start(self, tmp_path: Path, systemd: Systemd) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+        package = tmp_path / "fake/systemd"
+        package.mkdir(parents=True)
+        (package / "__init__.py").touch()
+        (package / "daemon.py").write_text(DAEMON)
+        started = []
+
+        def start(file: Path, **environment: str) -> subprocess.Popen[str]:
+            process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "bridged",
+                    "run",
+                    str(file),
+                    "--socket",
+                    str(tmp_path / "status.sock"),
+                ],
+                env={k: v for k, v in os.environ.items() if k != "JOURNAL_STREAM"}
+                | {
+                    "NOTIFY_SOCKET": str(systemd.path),
+                    "PYTHONPATH": str(package.parent),
+                    "STATE_DIRECTORY": str(tmp_path),
+                    **environment,
+                },
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            started.append(process)
+            return process
+
+        yield start
+        for process in started:
+            process.kill()
+            process.communicate()
+
+    def test_ready_without_an_adapter_and_stopped(
+        self, tmp_path: Path, systemd: Systemd, start: Callable[..., subprocess.Popen[str]]
+    ) -> None:
+        process = start(write_config(tmp_path / "one.yaml"))
+        assert systemd.wait_for("READY=1")[-1] == "READY=1"
+        waiting = systemd.wait_for("STATUS=waiting: ")[-1]
+        assert "/nowhere/tty: does not exist" in waiting
+        process.terminate()
+        assert systemd.hear() == "STOPPING=1"
+        assert process.wait(DEADLINE_S) == 0
+
+    def test_reload(
+        self, tmp_path: Path, systemd: Systemd, start: Callable[..., subprocess.Popen[str]]
+    ) -> None:
+        file = write_config(tmp_path / "one.yaml")
+        process = start(file)
+        systemd.wait_for("STATUS=waiting: /nowhere/tty")
+
+        process.send_signal(signal.SIGHUP)
+        assert systemd.hear().startswith("RELOADING=1\nMONOTONIC_USEC=")
+        assert systemd.hear() == "READY=1"
+
+        file.write_text(file.read_text().replace("bitrate", "bitrat"))
+        process.send_signal(signal.SIGHUP)
+        heard = systemd.wait_for("STATUS=")
+        assert [text.partition("\n")[0] for text in heard[:-1]] == ["RELOADING=1", "READY=1"]
+        assert heard[-1].startswith("STATUS=waiting: /nowhere/tty")
+        assert f"reload refused: {file}:2:1: channel.bitrate" in heard[-1]
+
+        write_config(file, port="/nowhere/other")
+        process.send_signal(signal.SIGHUP)
+        heard = systemd.wait_for("STATUS=waiting: /nowhere/other")
+        kinds = [text.partition("\n")[0] for text in heard if not text.startswith("STATUS")]
+        assert kinds == ["RELOADING=1", "READY=1"]
+        assert "refused" not in heard[-1]
+
+        process.terminate()
+        systemd.wait_for("STOPPING=1")
+        _, log = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0
+        assert "reload: nothing has changed" in log
+        assert f"reload refused: {file}:2:11: channel.bitrat" in log
+        assert log.count("bus open") == 1
+
+    def test_the_watchdog_is_fed(
+        self, tmp_path: Path, systemd: Systemd, start: Callable[..., subprocess.Popen[str]]
+    ) -> None:
+        file = write_config(tmp_path / "one.yaml")
+        assert start(file, WATCHDOG_USEC="100000")
+        for _ in range(3):
+            systemd.wait_for("WATCHDOG=1")
+
+    def test_without_systemd_python_it_says_so(
+        self, tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
+    ) -> None:
+        (tmp_path / "fake/systemd/daemon.py").unlink()
+        (tmp_path / "fake/systemd/daemon").mkdir()  # a package without notify()
+        process = start(write_config(tmp_path / "one.yaml"))
+        _, log = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 78
+        assert "apt install python3-systemd" in log
+
+
+class TestReload:
+    @pytest.fixture
+    def running(self, tmp_path: Path) -> tuple[Service, Path, list[str]]:
+        """A service in this process; the test's own thread is the one that runs it."""
+        file = write_config(tmp_path / "one.yaml", bus=tmp_path.name)
+        memory = FileMemory(tmp_path)
+        heard: list[str] = []
+
+        def successor(present: Any) -> Bridge | None:
+            fresh = load(file)
+            return None if fresh == present else Bridge(fresh, memory)
+
+        return Service(Bridge(load(file), memory), Notifier(heard.append), successor), file, heard
+
+    def run(self, running: Service, steps: list[Callable[[], None]], heard: list[str]) -> None:
+        """Performs a step each time that READY=1 was said, then stops it."""
+
+        def perform() -> None:
+            end = time.monotonic() + DEADLINE_S
+            for n, step in enumerate(steps, 1):
+                while heard.count("READY=1") < n and time.monotonic() < end:
+                    threading.Event().wait(0.01)
+                step()
+
+        thread = threading.Thread(target=perform)
+        thread.start()
+        running.run()
+        thread.join()
+
+    def test_the_bus_stays_open_if_its_section_has_not_changed(
+        self, running: tuple[Service, Path, list[str]], caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level(logging.INFO)
+        made, file, heard = running
+        first = made.bridge
+        buses: list[object] = []
+
+        def change() -> None:
+            buses.append(first._bus_end.bus)
+            write_config(file, bus=file.parent.name, deadline=2.0)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+        def stop() -> None:
+            buses.append(made.bridge._bus_end.bus)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        self.run(made, [change, stop], heard)
+        assert made.bridge is not first
+        assert made.bridge.config.transmit.deadline_s == 2.0
+        assert buses[0] is buses[1]
+        assert sum("bus open" in message for message in caplog.messages) == 1
+        assert first.filenos()[1] == -1  # nothing of the first is left open
+
+    def test_another_bus_is_opened(self, running: tuple[Service, Path, list[str]]) -> None:
+        made, file, heard = running
+
+        def change() -> None:
+            write_config(file, bus=file.parent.name + "b")
+            os.kill(os.getpid(), signal.SIGHUP)
+
+        self.run(made, [change, lambda: os.kill(os.getpid(), signal.SIGTERM)], heard)
+        assert made.bridge.config.bus.channel.endswith("b")
+        assert made.bridge.state is State.STOPPED
+
+    def test_a_stop_ends_a_reload(self, running: tuple[Service, Path, list[str]]) -> None:
+        made, file, heard = running
+        first = made.bridge
+
+        def both() -> None:
+            write_config(file, deadline=2.0)
+            os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        self.run(made, [both], heard)
+        assert made.bridge.finished
+        assert heard[-1] == "STATUS=stopping"
+        assert made.bridge is first or made.bridge.config.transmit.deadline_s == 2.0
+
+    def test_without_a_successor_sighup_stops(self, tmp_path: Path) -> None:
+        file = write_config(tmp_path / "one.yaml", bus=tmp_path.name)
+        heard: list[str] = []
+        made = Service(Bridge(load(file), FileMemory(tmp_path)), Notifier(heard.append))
+        self.run(made, [lambda: os.kill(os.getpid(), signal.SIGHUP)], heard)
+        assert made.bridge.state is State.STOPPED
+
+
+class TestWatchdog:
+    def test_fed_only_if_the_relay_turns(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard: list[str] = []
+        turned = True
+        bridge: Any = SimpleNamespace(finished=False, has_turned=lambda: turned)
+        made = Service(bridge, Notifier(heard.append, 5.0))
+        made._feed(0.0)
+        assert heard == []  # not ready yet
+        made._feed_at = 0.0
+        made._feed(0.0)
+        made._feed(4.9)
+        assert heard == ["WATCHDOG=1"]
+        turned = False
+        made._feed(5.0)
+        assert heard == ["WATCHDOG=1"]
+        assert "the relay hangs" in caplog.text
+        turned = True
+        made._feed(10.0)
+        assert heard == ["WATCHDOG=1"] * 2
+
+    def test_a_relay_that_does_not_run_has_not_turned(self, tmp_path: Path) -> None:
+        bridge = Bridge(load(write_config(tmp_path / "one.yaml")), FileMemory(tmp_path))
+        assert bridge.has_turned()  # nothing to compare with yet
+        assert not bridge.has_turned()
+        bridge._relay.turn(0)
+        assert bridge.has_turned()
+        bridge.close()
+
+    @pytest.mark.parametrize(
+        ("environment", "interval_s"),
+        [
+            ({}, None),
+            ({"WATCHDOG_USEC": "10000000"}, 5.0),
+            ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 5.0),
+            ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
+            ({"WATCHDOG_USEC": "0"}, None),
+            ({"WATCHDOG_USEC": "often"}, None),
+        ],
+    )
+    def test_interval(self, environment: dict[str, str], interval_s: float | None) -> None:
+        assert notify.feed_interval_s(environment) == interval_s
+
+
+class TestNotifier:
+    def test_nobody_asked(self) -> None:
+        made = notify.systemd_notifier({})
+        made.ready()
+        assert made.feed_interval_s is None
+
+    def test_a_status_is_one_line_and_told_once(self) -> None:
+        heard: list[str] = []
+        made = Notifier(heard.append)
+        for text in ("a\nb", "a\nb", "c"):
+            made.status(text)
+        assert heard == ["STATUS=a b", "STATUS=c"]
+
+    def test_a_systemd_that_does_not_listen_is_no_reason_to_end(
+        self, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        def refuse(_text: str) -> None:
+            raise ConnectionRefusedError
+
+        Notifier(refuse).ready()
+        assert "cannot notify systemd" in caplog.text
+
+    def test_a_missing_package_is_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "systemd", None)
+        with pytest.raises(ConfigError, match="python3-systemd"):
+            notify.systemd_notifier({"NOTIFY_SOCKET": "/run/systemd/notify"})
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "bus_open", "line"),
+    [
+        (State.RUNNING, "", True, RUNNING),
+        (State.RUNNING, "vcan0 is down", True, f"{RUNNING}, but vcan0 is down"),
+        (State.WAITING, "it does not exist", True, "waiting: it does not exist"),
+        (State.BACKOFF, "no answer", True, "waiting: no answer"),
+        (State.FAULT, "the wrong one", True, "fault: the wrong one"),
+        (State.IDLE, "no such interface", False, "bus not open: no such interface"),
+        (State.OPENING, "", True, ""),
+        (State.STOPPING, "", True, "stopping"),
+    ],
+)
+def test_status_line(state: State, reason: str, bus_open: bool, line: str) -> None:
+    bridge: Any = SimpleNamespace(
+        config=SimpleNamespace(
+            adapter=SimpleNamespace(type="usb2can", port="/dev/ttyUSB0"), bus=SimpleNamespace(channel="vcan0")
+        ),
+        adapter=SimpleNamespace(
+            identity=SimpleNamespace(version="HW0003FW0016", serial_number="RIG0001"),
+        ),
+    )
+    assert service._describe(bridge, state, reason, bus_open=bus_open) == line
+
+
+class TestLog:
+    def record(self, level: int = logging.WARNING, text: str = "one\ntwo") -> logging.LogRecord:
+        return logging.LogRecord("bridged.x", level, __file__, 1, text, (), None)
+
+    def test_fields(self) -> None:
+        fields = journal.Fields("can232")
+        fields.state = lambda: "running"
+        record = self.record()
+        assert fields.filter(record)
+        assert json.dumps([record.__dict__["BRIDGE"], record.__dict__["STATE"]]) == '["can232", "running"]'
+
+    def test_each_line_has_its_priority(self) -> None:
+        made = journal.PrefixFormatter("can232: %(message)s")
+        assert made.format(self.record()) == "<4>can232: one\n<4>two"
+        assert made.format(self.record(logging.INFO, "x")) == "<6>can232: x"
+
+    def test_stderr_is_the_journal_only_if_it_is_the_same_stream(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        with (tmp_path / "stream").open("w") as stream:
+            monkeypatch.setattr(sys, "stderr", stream)
+            monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+            assert not journal._stderr_is_journal()
+            identity = os.fstat(stream.fileno())
+            monkeypatch.setenv("JOURNAL_STREAM", f"{identity.st_dev}:{identity.st_ino}")
+            assert journal._stderr_is_journal()
+            monkeypatch.setenv("JOURNAL_STREAM", f"{identity.st_dev}:{identity.st_ino + 1}")
+            assert not journal._stderr_is_journal()
+        assert not journal._stderr_is_journal()
+
+
+def test_sighup_of_a_terminal_stops_and_of_a_service_reloads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    monkeypatch.setattr(os, "open", lambda *_: os.dup(0))
+    assert not service.hangup_means_reload()
+    monkeypatch.setenv("NOTIFY_SOCKET", "/run/systemd/notify")
+    assert service.hangup_means_reload()
