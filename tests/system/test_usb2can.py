@@ -421,7 +421,7 @@ def test_listen_only_with_a_filter(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ("configured", "there", "reason"),
-    [("usb2can", "can232", "is it the USB2CAN"), ("can232", "usb2can", "did not answer")],
+    [("usb2can", "can232", "is it the USB2CAN"), ("can232", "usb2can", "no answer to V")],
 )
 def test_wrong_device(rig: Rig, configured: str, there: str, reason: str) -> None:
     near, far = rig.vcan(), rig.vcan()
