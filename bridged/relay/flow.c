@@ -116,7 +116,8 @@ static void level_observe(struct relay *r, uint32_t level, uint32_t taken, int64
     f->level = level;
     if (left)
         f->left_at_ns = now;
-    if (!level || now - f->left_at_ns <= r->set.deadline_ns)
+    int64_t limit = r->set.deadline_ns > STOP_LIMIT_NS ? r->set.deadline_ns : STOP_LIMIT_NS;
+    if (!level || now - f->left_at_ns <= limit) /* a slow, busy bus is no reason */
         return;
     f->left_at_ns = NEVER; /* said once */
     relay_emit(r, EVENT_STUCK, level, NULL, 0);
@@ -150,12 +151,12 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
     int level = r->set.codec->level(msg->text, msg->length);
     if (f->stopped)
         f->stopped = !(level >= 0 && level < (int)f->ready) && now - f->stopped_ns < STOP_LIMIT_NS;
-    if (level >= 0)
+    if (level >= 0) {
         level_observe(r, (uint32_t)level, taken_count, now);
-    if (level >= 0)
         f->room = room_above(f, (uint32_t)level);
-    else
+    } else {
         f->room = f->critical < f->capacity ? room_above(f, f->critical) : !f->sent_count;
+    }
     if (f->stopped || !f->room)
         ask_again_at(f, now);
     else if (f->level)
