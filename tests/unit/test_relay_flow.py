@@ -236,20 +236,50 @@ def test_no_order_is_reversed_across_a_reconnect() -> None:
     with rig_with() as rig:
         rig.send(numbered(0))
         rig.run_until_done()
+        rig.device.refusals = 1
         rig.device.drop_answers = 1
-        rig.send(numbered(1, 0x200))
-        rig.device.refusals = 1
-        rig.run(0.002)
-        first, second = numbered(2, 0x100), numbered(3, 0x100)
-        rig.device.refusals = 1
-        rig.send(first, second)
+        first, second = numbered(1, 0x100), numbered(2, 0x100)
+        for frame in (first, second):
+            rig.bus.send(packed(frame))
+        rig.turn()
         rig.run(0.01)
+        assert rig.counters()["tx_returned"] == 1
         rig.relay.detach_port()
         rig.relay.attach_port(rig._near_port)
         rig.open()
-        rig.run_until_done(3.0)
-        ids = [frame.data for frame in rig.sent if frame.can_id == 0x100]
-        assert ids == sorted(ids)
+        c = rig.run_until_done(3.0)
+        assert rig.sent == [numbered(0), second]
+        assert (c["unanswered"], c["overtaken"]) == (1, 1)
+
+
+def test_what_was_handed_back_while_the_device_was_mute_is_not_taken_for_sent() -> None:
+    with rig_with() as rig:
+        rig.send(numbered(0))
+        rig.run_until_done()
+        rig.device.refusals = 9
+        rig.device.silent = True
+        rig.send(*(numbered(n) for n in range(1, 10)))
+        rig.run(0.003)
+        rig.device.silent = False
+        c = rig.run_until_done()
+        assert (c["tx_frames"], c["unanswered"]) == (1, 9)
+        assert rig.sent == [numbered(0)]
+
+
+def test_a_device_that_dies_while_it_is_closed_is_not_asked_for_mode_normal() -> None:
+    """A resynchronisation could not succeed any more, and would cost a second of the time to stop."""
+    with rig_with() as rig:
+        rig.send(numbered(0))
+        rig.run_until_done()
+        rig.device.silent = True
+        rig.send(numbered(1))
+        rig.relay.set_gates(receiving=True, transmit=_relay.GATE_STOPPED)
+        begin = rig.now
+        rig.perform(rig.adapter.close_steps())
+        assert rig.now - begin < 1.6 * S
+        c = rig.counters()
+        assert (c["resyncs"], c["unanswered"], c["queued"]) == (0, 1, 0)
+        rig.device.violations.clear()
 
 
 def test_frames_that_do_not_leave_the_device_are_noticed() -> None:
