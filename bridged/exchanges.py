@@ -44,6 +44,8 @@ class Exchanges:
         return self._steps is not None
 
     def ask(self, exchange: Exchange, then: Callable[[Answer], None]) -> None:
+        if exchange.opens:
+            self._relay.set_gates(receiving=True, transmit=_relay.GATE_AWAY)
         token = next(self._tokens) & 0xFFFFFFFF
         self._pending[token] = then
         replies = exchange.accept + exchange.reject

@@ -30,6 +30,7 @@ class Exchange:
     prefix: bytes = b""  # how the text that answers begins
     advice: str = ""  # what the user can do when it is rejected
     timeout_s: float = 0.5
+    opens: bool = False  # the channel: frames that come from now on are received
 
 
 @dataclass(frozen=True, slots=True)

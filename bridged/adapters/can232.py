@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import re
 from typing import TYPE_CHECKING
@@ -208,9 +209,10 @@ class Can232:
 
     def _open(self) -> Steps:
         if self._channel.listen_only:
-            yield self._step(b"L\r", "open the channel in listen-only mode (L)")
+            step = self._step(b"L\r", "open the channel in listen-only mode (L)")
         else:
-            yield self._step(b"O\r", "open the channel (O)")
+            step = self._step(b"O\r", "open the channel (O)")
+        yield dataclasses.replace(step, opens=True)
 
     def _auto_poll(self) -> Generator[Exchange, Answer, bool]:
         """Whether frames come by themselves: then A is refused (manual 2.0, A). X cannot be read."""

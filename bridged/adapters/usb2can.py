@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import re
@@ -120,8 +121,8 @@ class Usb2can:
         yield from self._configure()
         levels = yield from self._set_limits()
         yield from self._enter_normal_mode()
-        yield from self._start_controller()
         yield from self._find_health()
+        yield from self._start_controller()
         if levels:
             assert self._levels_prefix is not None
             ask, prefix = message(COMMAND, GET), self._levels_prefix
@@ -301,7 +302,8 @@ class Usb2can:
     def _start_controller(self) -> Steps:
         """Step 10. A listener that acknowledges, or a filter of the other kind, must not go unnoticed."""
         bits = self._mode_bits
-        yield from self._write("MOD", MOD, bits)
+        for step in self._write("MOD", MOD, bits):
+            yield dataclasses.replace(step, opens=True)
         if not bits:
             return
         answer = yield _exchange(message(READ_REG, MOD), "tell register MOD", bytes((READ_REG, 2, MOD)))

@@ -394,7 +394,9 @@ class Rig:
         step = 1 / rate if rate else 0.0
         log.write_text("".join(f"({n * step:.6f}) {interface} {frame}\n" for n, frame in enumerate(frames)))
         pace = ["-g", "1"] if rate else ["-t"]
-        return self.start("canplayer", "-I", log, *pace)
+        # On one processor: while softirqs are behind, frames of a sender that moves to another change places.
+        processor = str(min(os.sched_getaffinity(0)))
+        return self.start("taskset", "-c", processor, "canplayer", "-I", log, *pace)
 
     def slcanpty(self, interface: str) -> tuple[Process, Path]:
         """can-utils' slcan adapter on a pseudo-terminal: the process, and the terminal a bridge opens."""

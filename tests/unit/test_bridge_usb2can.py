@@ -449,3 +449,13 @@ def test_events_are_told_or_counted(bench: Usb2canBench, caplog: pytest.LogCaptu
     assert_closed(bench, device)
     assert status["counters"]["rx_overruns"] == device.counters.overruns == 3
     assert status["counters"]["tx_stops"] == device.counters.stops
+
+
+def test_no_frame_is_lost_between_the_controllers_start_and_ours(bench: Usb2canBench) -> None:
+    """The bus is busy: frames come from the moment that register MOD lets the controller take part."""
+    device = bench.device_plugged_in(traffic_fps=5000)
+    bridge = started(bench.bridge())
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["rx_frames"] > 100)
+    status = stopped(bridge)
+    assert status["counters"]["rx_dropped"]["not-running"] == 0
+    assert device.counters.frames_unseen > 0  # there were some before
