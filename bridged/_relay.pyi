@@ -64,6 +64,8 @@ class Relay:
     def detach_bus(self) -> None: ...
     def set_gates(self, *, receiving: bool, transmit: int) -> None:
         """Whether frames from the device go to the bus, and what happens to those from the bus."""
+    def set_queue(self, queue: int, deadline: float, /) -> None:
+        """Both anew; frames for which there is no room any more are dropped, the newest first."""
     def set_polling(self, request: bytes, prefix: bytes, interval: float, /) -> None:
         """Ask the device for frames with `request` until the port is detached."""
     def set_flow(self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int) -> None:

@@ -16,6 +16,8 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
+from msgspec.structs import replace
+
 from bridged import _relay
 from bridged.adapters import make_adapter
 from bridged.bus_end import BusEnd, repeated
@@ -37,10 +39,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 UNANSWERED_LOG_S = 10.0
-ABORT_WAIT_S = 0.1
+LAST_WORDS_S = 0.1
+STOP_S = 1.5  # for an adapter that does not answer; systemd and users wait for the end
+STUCK_LEAST_S = 0.5  # as STUCK_LEAST_NS in queue.c
 
-# States that end at once when the device is plugged in; their reason is that of the failure before.
+# States that end at once when the device is plugged in.
 LOOKING_OUT = frozenset({State.WAITING, State.BACKOFF, State.FAULT})
+# Their reason is that of the failure before.
+AFTERMATH = LOOKING_OUT | {State.BUS_OFF}
+
+
+ANEW = (
+    "; the channel is closed and opened anew, which throws away what is in the adapter's buffer, "
+    "so that nothing is sent late"
+)
 
 
 def _reason(error: int) -> str:
@@ -76,6 +88,9 @@ class Bridge:
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._opening = False  # a thread opens the port
         self._discarded = 0
+        self._starts = 0  # how often it began to run
+        self._restart_pause_s = 0.0  # as long as bus-off is to last at least
+        self._restarting = False  # after bus-off
         self._unanswered_log_at = 0.0
         self._turns: object = None  # of the relay, when they were looked at last
         sync = self.adapter.sync
@@ -96,6 +111,8 @@ class Bridge:
             ask=self._exchanges.ask,
             tell=self._bus_end.put_error_frame,
             failed=lambda reason: self._dispatch(Event.SILENT, reason),
+            bus_off=self._on_bus_off,
+            stuck_s=self._stuck_s,
             counters=self._relay.counters,
         )
         self._thread = threading.Thread(target=self._relay.run, name="relay")
@@ -141,7 +158,8 @@ class Bridge:
         if self._timer is not None and self._timer <= now:
             self._timer = None
             self._dispatch(Event.TIMER)
-        self._bus_end.on_timer(now)
+        if self._bus_end.on_timer(now):
+            self._dispatch(Event.RESTART)
         self._start_with_bus()
         self._polling.on_timer(now)
 
@@ -150,6 +168,24 @@ class Bridge:
         turns, self._turns = self._turns, self._relay.counters()["turns"]
         self._relay.wake()
         return turns != self._turns
+
+    def adopt(self, config: Config) -> bool:
+        """Goes on with other settings; False: with these it cannot, a new bridge must take its place."""
+        present = self.config
+        transmit = replace(
+            present.transmit, queue=config.transmit.queue, deadline_s=config.transmit.deadline_s
+        )
+        channel = replace(present.channel, restart_s=config.channel.restart_s)
+        if config != replace(
+            present, channel=channel, transmit=transmit, health=config.health, reconnect=config.reconnect
+        ):
+            return False
+        self.config = config
+        self._relay.set_queue(transmit.queue, transmit.deadline_s)
+        self._bus_end.adopt(config)
+        self._polling.adopt(config.health.interval_s, self._stuck_s)
+        self._backoff.adopt(config.reconnect.initial_s, config.reconnect.maximum_s)
+        return True
 
     def condition(self) -> tuple[State, str, bool]:
         """The state, the reason why it is not running, whether the bus is open."""
@@ -193,6 +229,7 @@ class Bridge:
                 "tx_frames": counters.pop("tx_frames"),
                 "rx_errors": counters.pop("skipped_messages"),
                 "tx_retries": counters.pop("tx_retries"),
+                "reconnects": max(0, self._starts - 1),
                 "bus_off_restarts": health.restarts,
                 **health.happened,
                 **self._bus_end.error_frames,
@@ -223,7 +260,7 @@ class Bridge:
 
     def _log_transition(self, reason: str) -> None:
         """One line; retries, and what is repeated too often, for those who look for a fault only."""
-        self.reason = reason or (self.reason if self.state in LOOKING_OUT else "")
+        self.reason = reason or (self.reason if self.state in AFTERMATH else "")
         times = self._told.tell(reason, time.monotonic()) if reason else None
         if times is not None:
             log.warning("state=%s: %s%s", self.state.value, reason, repeated(times))
@@ -251,10 +288,16 @@ class Bridge:
                 self._run()
             case Action.CLOSE:
                 self._close_channel()
+            case Action.LIMIT:
+                self._timer = time.monotonic() + STOP_S
+            case Action.LAST_WORDS:
+                log.warning("the adapter did not answer in time: its channel may still be open")
+                self._last_words()
             case Action.RELEASE:
                 self._release()
             case Action.WAIT:
-                self._wait(self._backoff.next_s(time.monotonic()))
+                pause_s, self._restart_pause_s = self._restart_pause_s, 0.0
+                self._wait(max(pause_s, self._backoff.next_s(time.monotonic())))
             case Action.WAIT_LONG:
                 self._wait(self._backoff.longest_s())
             case Action.HURRY:
@@ -313,7 +356,9 @@ class Bridge:
         listen_only = self.config.channel.listen_only
         gate = _relay.GATE_LISTEN_ONLY if listen_only else _relay.GATE_OPEN
         self._relay.set_gates(receiving=True, transmit=gate)
-        self._polling.start(time.monotonic())
+        self._polling.start(time.monotonic(), restarted=self._restarting)
+        self._restarting = False
+        self._starts += 1
         identity = self.adapter.identity
         log.info("adapter version=%s serial_number=%s", identity.version, identity.serial_number)
 
@@ -345,17 +390,22 @@ class Bridge:
 
     def abort(self) -> None:
         """For an exception that nobody expected: ends the relay, closes the channel as well as may be."""
-        self._relay.detach_port()
         self._relay.stop()
         if self._thread.is_alive():
             self._thread.join()
+        self._last_words()
         if self._port is not None:
-            with contextlib.suppress(OSError):
-                os.write(self._port.fd, self.adapter.last_words)
-                time.sleep(ABORT_WAIT_S)  # close() throws away what is not out yet
             self._port.close()
             self._port = None
         self.finished = True
+
+    def _last_words(self) -> None:
+        """Closes the channel without awaiting answers."""
+        self._relay.detach_port()
+        if self._port is not None:
+            with contextlib.suppress(OSError):
+                os.write(self._port.fd, self.adapter.last_words)
+                time.sleep(LAST_WORDS_S)  # close() throws away what is not out yet
 
     @property
     def settled(self) -> bool:
@@ -411,13 +461,31 @@ class Bridge:
             self._unanswered_log_at = now + UNANSWERED_LOG_S
             log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", resyncs)
 
+    @property
+    def _stuck_s(self) -> float:
+        return max(self.config.transmit.deadline_s, STUCK_LEAST_S)
+
     def _on_stuck(self, frames: int) -> None:
         """What waits in the adapter's own buffer would be sent whenever the bus lets it, however old."""
         if self.state is not State.RUNNING:
             return
         self._discarded += frames
-        reason = (
-            f"no frame has left the adapter for {self.config.transmit.deadline_s:g} s (is another node on "
-            f"the bus, to acknowledge them?): those in its buffer are thrown away, so that none is sent late"
-        )
-        self._dispatch(Event.SILENT, reason)
+        cause = f"no frame has left the adapter for {self._stuck_s:g} s (does another node acknowledge them?)"
+        if self.adapter.flow is None:  # it cannot tell bus-off
+            self._on_bus_off(f"{cause}, its status: {self._polling.description}")
+        else:
+            self._dispatch(Event.SILENT, f"{cause}{ANEW}")
+
+    def _on_bus_off(self, cause: str) -> None:
+        """It is, or cannot tell whether it is."""
+        restart_s = self.config.channel.restart_s
+        if self.state is not State.RUNNING or restart_s == 0.0:
+            return
+        if restart_s is None:
+            interface = self.config.bus.channel
+            advice = f"ip link set {interface} down, then up, puts it on the bus again"
+            self._dispatch(Event.BUS_OFF, f"{cause}; channel.restart is never: {advice}")
+            return
+        self._restart_pause_s = restart_s
+        self._restarting = True
+        self._dispatch(Event.SILENT, f"{cause}{ANEW}")

@@ -59,14 +59,20 @@ class BusEnd:
         self.bus = bus
         self._relay.attach_bus(bus.fd)
 
-    def on_timer(self, now: float) -> None:
+    def adopt(self, config: Config) -> None:
+        """Other settings, but for the interface."""
+        self._config = config
+
+    def on_timer(self, now: float) -> bool:
+        """Whether the interface has come up, or back."""
         if self.next_at is None or now < self.next_at:
-            return
+            return False
         self.next_at = None
         if self.bus is None:
             self.open()
         else:
             self._look()
+        return not self.reason
 
     def on_lost(self, error: int) -> None:
         """The relay says so, with the errno of its last call or 0."""

@@ -53,6 +53,10 @@ Register = Annotated[int, Meta(ge=0, le=0xFF, description="a register value from
 SamplePoint = Annotated[
     float, Meta(ge=0.5, le=0.95, description="a fraction of the bit time from 0.5 to 0.95")
 ]
+Restart = Annotated[
+    Annotated[int, Meta(ge=1, le=60_000)] | Literal["never"],
+    Meta(description="a number of milliseconds from 1 to 60000, or never"),
+]
 Word = Annotated[int, Meta(ge=0, le=0xFFFFFFFF, description="a number from 0x00000000 to 0xFFFFFFFF")]
 FilterMode = Annotated[Literal["dual", "single"], Meta(description="dual or single")]
 InterfaceType = Annotated[
@@ -80,6 +84,7 @@ class Can232Config(Struct, frozen=True, kw_only=True):
     """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s."""
 
     default_window: ClassVar[int] = 1
+    default_restart_s: ClassVar[float] = 0.1
 
     type: Annotated[Literal["can232"], ADAPTER_TYPES]
     port: Port
@@ -95,6 +100,7 @@ class Usb2canConfig(Struct, frozen=True, kw_only=True):
     """
 
     default_window: ClassVar[int] = 16
+    default_restart_s: ClassVar[float] = 0.0  # it restarts itself
 
     type: Annotated[Literal["usb2can"], ADAPTER_TYPES]
     port: Port
@@ -119,14 +125,20 @@ class _ChannelKeys(Struct, frozen=True, kw_only=True):
     sample_point: SamplePoint | None = None
     listen_only: Flag = False
     acceptance: _AcceptanceKeys | None = None
+    restart: Restart | None = None
 
 
 class ChannelConfig(Struct, frozen=True, kw_only=True):
-    """The CAN bus behind the adapter. `acceptance` None: every frame passes."""
+    """The CAN bus behind the adapter. `acceptance` None: every frame passes.
+
+    `restart_s`: after bus-off the channel is closed, and opened again after so long; None: not until the
+    interface comes up anew; 0: it stays open, the adapter restarts itself.
+    """
 
     timing: can.BitTiming
     listen_only: bool = False
     acceptance: can.AcceptanceFilter | None = None
+    restart_s: float | None = 0.0
 
 
 class _BusKeys(Struct, frozen=True, kw_only=True):
@@ -230,7 +242,7 @@ def _read_file(path: Path, top: Section) -> Config | None:
     top.refuse_unknown([path for path in _SECTIONS if "." not in path])
     adapter = _read_adapter(top.section("adapter"))
     channel_section = top.section("channel")
-    channel = _read_channel(channel_section)
+    channel = _read_channel(channel_section, adapter)
     bus = _read_bus(top.section("bus"))
     transmit_section = top.section("transmit", required=False) if "transmit" in top.nodes else None
     transmit = _read_transmit(transmit_section, adapter)
@@ -357,7 +369,7 @@ def _read_reconnect(top: Section) -> ReconnectConfig | None:
     return reconnect
 
 
-def _read_channel(section: Section | None) -> ChannelConfig | None:
+def _read_channel(section: Section | None, adapter: AdapterConfig | None) -> ChannelConfig | None:
     if section is None:
         return None
     values = section.read(_ChannelKeys)
@@ -367,9 +379,19 @@ def _read_channel(section: Section | None) -> ChannelConfig | None:
         keys := _read_plain(section.section("acceptance", required=False), _AcceptanceKeys)
     ):
         acceptance = can.AcceptanceFilter(keys.code, keys.mask, single=keys.mode == "single")
-    if timing is None:
+    if timing is None or adapter is None:
         return None
-    return ChannelConfig(timing=timing, listen_only=values.get("listen_only", False), acceptance=acceptance)
+    restart: int | str | None = values.get("restart")
+    if isinstance(restart, int):
+        restart_s: float | None = restart / 1000
+    else:
+        restart_s = None if restart == "never" else adapter.default_restart_s
+    return ChannelConfig(
+        timing=timing,
+        listen_only=values.get("listen_only", False),
+        acceptance=acceptance,
+        restart_s=restart_s,
+    )
 
 
 def _read_timing(section: Section) -> can.BitTiming | None:

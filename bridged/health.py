@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import enum
 import struct
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 WARNING_LIMIT = 96
 PASSIVE_LIMIT = 128
@@ -50,8 +50,7 @@ class Happened(enum.Flag):
     RESTARTED = enum.auto()
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(NamedTuple):
     """What an adapter said of its bus. `state` None: it did not say; counters None: it cannot."""
 
     description: str
@@ -74,16 +73,16 @@ def state_of(tec: int, rec: int) -> BusState:
     return BusState.ERROR_WARNING if worst >= WARNING_LIMIT else BusState.ERROR_ACTIVE
 
 
-@dataclass
 class Health:
     """The state of the bus, from all observations; None: not known."""
 
-    state: BusState | None = None
-    tec: int | None = None
-    rec: int | None = None
-    restarts: int = 0  # after bus-off
-    happened: dict[str, int] = field(default_factory=dict)
-    _seen_s: float = 0.0  # when `state` was seen last, where it is not lasting
+    def __init__(self) -> None:
+        self.state: BusState | None = None
+        self.tec: int | None = None
+        self.rec: int | None = None
+        self.restarts = 0  # after bus-off
+        self.happened: dict[str, int] = {}
+        self._seen_s = 0.0  # when `state` was seen last, where it is not lasting
 
     def forget(self) -> None:
         """The adapter is away: nothing is known."""
@@ -130,6 +129,35 @@ class Health:
             return error_frame(CAN_ERR_CRTL, crtl=tx | rx)
         crtl = (tx if self.tec >= self.rec else 0) | (rx if self.tec <= self.rec else 0)
         return error_frame(CAN_ERR_CRTL, crtl=crtl, tec=self.tec, rec=self.rec)
+
+
+class Stall:
+    """Whether frames stay in the transmit buffer of a device that cannot tell how full it is.
+
+    That is taken for certain when there were bus errors at each look for `limit_s`, error-passive among them,
+    nothing was received meanwhile, and it has taken frames since the last look that found no errors.
+    The frames are counters of those received and taken.
+    """
+
+    def __init__(self, limit_s: float, rx_frames: int = 0, tx_frames: int = 0) -> None:
+        self.limit_s = limit_s
+        self._since_s: float | None = None
+        self._passive = False
+        self._rx_frames = rx_frames
+        self._tx_frames = tx_frames  # when all was well
+
+    def observe(self, seen: Observation, now_s: float, rx_frames: int, tx_frames: int) -> bool:
+        errors = Happened.BUS_ERROR in seen.happened and rx_frames == self._rx_frames
+        self._rx_frames = rx_frames
+        if not errors:
+            self._since_s = None
+            self._passive = False
+            self._tx_frames = tx_frames
+            return False
+        if self._since_s is None:
+            self._since_s = now_s
+        self._passive |= seen.state is BusState.ERROR_PASSIVE
+        return self._passive and tx_frames > self._tx_frames and now_s - self._since_s >= self.limit_s
 
 
 def _notice(happened: Happened) -> bytes | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -30,6 +29,8 @@ class State(enum.Enum):
     CLOSING = "closing"  # something failed; the channel is closed before the next try
     BACKOFF = "backoff"  # a pause before the next try
     FAULT = "fault"  # after REJECTING: tried again slowly
+    LEAVING = "leaving"  # bus-off, and not to be restarted; the channel is being closed
+    BUS_OFF = "bus-off"  # after LEAVING: until somebody restarts it
     STOPPING = "stopping"  # told to stop; the channel is being closed
     STOPPED = "stopped"
 
@@ -43,7 +44,9 @@ class Event(enum.Enum):
     READY = enum.auto()  # initialised
     UNANSWERED = enum.auto()  # a step of the initialisation had no answer
     REFUSED = enum.auto()  # wrong device, or a refused setting
-    SILENT = enum.auto()  # the running adapter answers nothing any more
+    SILENT = enum.auto()  # the running adapter answers nothing any more, or must begin anew
+    BUS_OFF = enum.auto()  # and must not be restarted
+    RESTART = enum.auto()  # the interface came up: whoever did that wants the bus back
     PORT_LOST = enum.auto()
     CLOSED = enum.auto()  # the closing steps are done, whatever they met
     TIMER = enum.auto()
@@ -56,6 +59,8 @@ class Action(enum.Enum):
     INITIALISE = enum.auto()  # -> READY, UNANSWERED, REFUSED
     RUN = enum.auto()  # open the gates
     CLOSE = enum.auto()  # close the gates, then the channel -> CLOSED
+    LIMIT = enum.auto()  # nobody waits longer for the end -> TIMER
+    LAST_WORDS = enum.auto()  # close the channel without awaiting answers
     RELEASE = enum.auto()  # give the port back
     WAIT = enum.auto()  # -> TIMER, or APPEARED if the device is plugged in anew before
     WAIT_LONG = enum.auto()  # the same
@@ -80,16 +85,23 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.INITIALISING, E.UNANSWERED): (S.CLOSING, (A.CLOSE,)),
     (S.INITIALISING, E.REFUSED): (S.REJECTING, (A.CLOSE,)),
     (S.INITIALISING, E.PORT_LOST): (S.BACKOFF, (A.RELEASE, A.WAIT)),
-    (S.INITIALISING, E.STOP): (S.STOPPING, (A.CLOSE,)),
+    (S.INITIALISING, E.STOP): (S.STOPPING, (A.LIMIT, A.CLOSE)),
     (S.RUNNING, E.SILENT): (S.CLOSING, (A.CLOSE,)),
     (S.RUNNING, E.PORT_LOST): (S.BACKOFF, (A.RELEASE, A.WAIT)),
-    (S.RUNNING, E.STOP): (S.STOPPING, (A.CLOSE,)),
+    (S.RUNNING, E.BUS_OFF): (S.LEAVING, (A.CLOSE,)),
+    (S.RUNNING, E.STOP): (S.STOPPING, (A.LIMIT, A.CLOSE)),
     (S.CLOSING, E.CLOSED): (S.BACKOFF, (A.RELEASE, A.WAIT)),
     (S.CLOSING, E.PORT_LOST): (S.BACKOFF, (A.RELEASE, A.WAIT)),
-    (S.CLOSING, E.STOP): (S.STOPPING, (A.CLOSE,)),
+    (S.CLOSING, E.STOP): (S.STOPPING, (A.LIMIT, A.CLOSE)),
     (S.REJECTING, E.CLOSED): (S.FAULT, (A.RELEASE, A.WAIT_LONG)),
     (S.REJECTING, E.PORT_LOST): (S.FAULT, (A.RELEASE, A.WAIT_LONG)),
-    (S.REJECTING, E.STOP): (S.STOPPING, (A.CLOSE,)),
+    (S.REJECTING, E.STOP): (S.STOPPING, (A.LIMIT, A.CLOSE)),
+    (S.LEAVING, E.CLOSED): (S.BUS_OFF, (A.RELEASE,)),
+    (S.LEAVING, E.PORT_LOST): (S.BUS_OFF, (A.RELEASE,)),
+    (S.LEAVING, E.RESTART): (S.CLOSING, ()),
+    (S.LEAVING, E.STOP): (S.STOPPING, (A.LIMIT, A.CLOSE)),
+    (S.BUS_OFF, E.RESTART): (S.OPENING, (A.OPEN,)),
+    (S.BUS_OFF, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.BACKOFF, E.TIMER): (S.OPENING, (A.OPEN,)),
     (S.BACKOFF, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
     (S.BACKOFF, E.STOP): (S.STOPPED, (A.FINISH,)),
@@ -98,16 +110,28 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.FAULT, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.STOPPING, E.CLOSED): (S.STOPPED, (A.RELEASE, A.FINISH)),
     (S.STOPPING, E.PORT_LOST): (S.STOPPED, (A.RELEASE, A.FINISH)),
+    (S.STOPPING, E.TIMER): (S.STOPPED, (A.LAST_WORDS, A.RELEASE, A.FINISH)),
     # The port was opened for nothing while the bridge was told to stop.
     (S.STOPPED, E.OPENED): (S.STOPPED, (A.RELEASE,)),
 }
 
 # Late news, without meaning for the state they meet.
 IGNORED: frozenset[tuple[State, Event]] = frozenset(
-    [(S.CLOSING, E.SILENT), (S.REJECTING, E.SILENT), (S.STOPPING, E.SILENT), (S.STOPPING, E.STOP)]
+    [(S.STOPPING, E.STOP)]
+    + [
+        (state, event)
+        for state in (S.CLOSING, S.REJECTING, S.LEAVING, S.STOPPING)
+        for event in (E.SILENT, E.BUS_OFF)
+    ]
     # They came with the news that ended it.
-    + [(state, event) for state in (S.BACKOFF, S.FAULT) for event in (E.PORT_LOST, E.SILENT)]
-    + [(S.STOPPED, event) for event in (E.STOP, E.ABSENT, E.OPEN_FAILED, E.PORT_LOST, E.SILENT)]
+    + [
+        (state, event)
+        for state in (S.BACKOFF, S.FAULT, S.BUS_OFF)
+        for event in (E.PORT_LOST, E.SILENT, E.BUS_OFF)
+    ]
+    + [(S.STOPPED, event) for event in (E.STOP, E.ABSENT, E.OPEN_FAILED, E.PORT_LOST, E.SILENT, E.BUS_OFF)]
+    # Only what is bus-off waits for it.
+    + [(state, E.RESTART) for state in S if state not in {S.LEAVING, S.BUS_OFF}]
     # Only WAITING, BACKOFF and FAULT look out for the device; the news may be on its way when they end.
     + [(state, E.APPEARED) for state in S if state not in {S.IDLE, S.WAITING, S.BACKOFF, S.FAULT}]
 )
@@ -134,6 +158,11 @@ class Backoff:
         self._next_s = initial_s
         self._running_since: float | None = None
 
+    def adopt(self, initial_s: float, maximum_s: float) -> None:
+        """Other settings, and short pauses again."""
+        self._initial_s, self._maximum_s = initial_s, maximum_s
+        self.hurry()
+
     def runs(self, now: float) -> None:
         """The adapter runs, until next_s() or longest_s() is called."""
         self._running_since = now
@@ -158,12 +187,12 @@ class Backoff:
         return delay_s * (1 - JITTER * self._random())
 
 
-@dataclass(slots=True)
 class _Cause:
-    told_at: float
-    left: int  # how often it may be told until REPEAT_LOG_S have passed
-    untold: int = 0  # how often it came without being told
-    again: bool = False  # all was well since: it is news
+    def __init__(self, told_at: float, left: int) -> None:
+        self.told_at = told_at
+        self.left = left  # how often it may be told until REPEAT_LOG_S have passed
+        self.untold = 0  # how often it came without being told
+        self.again = False  # all was well since: it is news
 
 
 class Told:

@@ -5,7 +5,6 @@ EEPROM cells wear out, so a setting is written once and remembered by serial num
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 from pathlib import Path
@@ -40,6 +39,8 @@ class FileMemory:
         return self._directory / f"{safe}.json"
 
     def _load(self, serial_number: str) -> dict[str, int]:
+        import json  # noqa: PLC0415 - 2 ms, when the bridge is up already
+
         try:
             values = json.loads(self._path(serial_number).read_text())
         except FileNotFoundError:
@@ -53,6 +54,8 @@ class FileMemory:
         return self._load(serial_number).get(setting)
 
     def remember(self, serial_number: str, setting: str, value: int) -> None:
+        import json  # noqa: PLC0415
+
         path = self._path(serial_number)
         values = self._load(serial_number) | {setting: value}
         try:

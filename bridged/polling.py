@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import time
 from collections import deque
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridged.adapters.base import Reply
 from bridged.errors import AdapterError
-from bridged.health import UNKNOWN, BusState, Happened, Health, Observation
+from bridged.health import UNKNOWN, BusState, Happened, Health, Observation, Stall
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +28,8 @@ class HealthPolling:
     """One question at a time, the next one `interval_s` after the last answer.
 
     `ask` sends an exchange and calls back with its answer; `tell` puts an error frame on the bus; `failed`
-    hears why the adapter must be initialised again; `counters` are the relay's.
+    hears why the adapter must be initialised again, `bus_off` that it is bus-off, or gets rid of no frame for
+    `stuck_s` and may be; `counters` are the relay's.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
@@ -41,6 +41,8 @@ class HealthPolling:
         ask: Callable[[Exchange, Callable[[Answer], None]], None],
         tell: Callable[[bytes], None],
         failed: Callable[[str], None],
+        bus_off: Callable[[str], None],
+        stuck_s: float,
         counters: Callable[[], dict[str, Any]],
     ) -> None:
         self.health = Health()
@@ -50,6 +52,8 @@ class HealthPolling:
         self._ask = ask
         self._tell = tell
         self._failed = failed
+        self._bus_off = bus_off
+        self._stall = Stall(stuck_s)
         self._counters = counters
         self._overruns_seen = 0
         self._asked_at = 0.0
@@ -59,13 +63,18 @@ class HealthPolling:
         )  # time, frames to the bus, frames to the adapter
         self._steps: HealthSteps | None = None
         self._unknown = 0  # looks one after the other without an answer
+        self.description = ""  # what the adapter said last
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
         self._logged: dict[str, float] = {}  # what was in the log, and when
 
-    def start(self, now: float) -> None:
-        """The adapter runs."""
-        self._overruns_seen = self._counters()["rx_overruns"]
+    def start(self, now: float, *, restarted: bool = False) -> None:
+        """The adapter runs; `restarted`: after bus-off."""
+        if restarted:
+            self._take(Observation("restarted", happened=Happened.RESTARTED))
+        counters = self._counters()
+        self._stall = Stall(self._stall.limit_s, counters["decoded"], counters["tx_frames"])
+        self._overruns_seen = counters["rx_overruns"]
         self._unknown = 0
         self.next_at = now
 
@@ -76,6 +85,11 @@ class HealthPolling:
         self._refused = False
         self._samples.clear()
         self.health.forget()
+
+    def adopt(self, interval_s: float, stuck_s: float) -> None:
+        """Other settings."""
+        self._interval_s = interval_s
+        self._stall.limit_s = stuck_s
 
     def answer_times_ms(self) -> dict[str, float] | None:
         """How long the adapter took for its last answers."""
@@ -147,14 +161,19 @@ class HealthPolling:
             self._refused = False
             self._warn("adapter refuses frames; its status: %s", seen.description)
         if self._overtaken:
-            seen = dataclasses.replace(seen, state=None, tec=None, rec=None)
+            seen = seen._replace(state=None, tec=None, rec=None)
         self._take(seen)
         self._unknown = self._unknown + 1 if seen is UNKNOWN else 0
         if self._unknown == UNKNOWN_LIMIT:
             self._failed("the adapter does not answer questions about its bus")
             return
         counters = self._counters()
-        self._sample(time.monotonic(), counters["rx_frames"], counters["tx_frames"])
+        now = time.monotonic()
+        self._sample(now, counters["rx_frames"], counters["tx_frames"])
+        if self._stall.observe(seen, now, counters["decoded"], counters["tx_frames"]):
+            text = f"{seen.description} for {self._stall.limit_s:g} s, and nothing is received"
+            self._bus_off(f"{text}: it may be bus-off, or no other node acknowledges its frames")
+            return
         overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
             self._overruns_seen = overruns
@@ -168,6 +187,7 @@ class HealthPolling:
             self._samples.popleft()
 
     def _take(self, seen: Observation) -> None:
+        self.description = seen.description
         before = self.health.state
         for frame in self.health.observe(seen, time.monotonic()):
             self._tell(frame)
@@ -175,6 +195,8 @@ class HealthPolling:
         if state is not None and state != before and (before is not None or state != BusState.ERROR_ACTIVE):
             level = logging.INFO if state == BusState.ERROR_ACTIVE else logging.WARNING
             log.log(level, "bus_state=%s: %s", state.text, seen.description)
+            if state is BusState.BUS_OFF:
+                self._bus_off(seen.description)
 
     def _warn(self, pattern: str, text: str) -> None:
         """Each text once in LOG_INTERVAL_S."""

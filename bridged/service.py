@@ -71,7 +71,8 @@ def serve(bridge: Bridge, status: StatusServer | None) -> None:
 
 
 class Service:
-    """Runs `bridge`, and after each SIGHUP the one that `successor` makes; without it SIGHUP is a stop.
+    """Runs `bridge`, and after each SIGHUP the one that `successor` makes, or the same if that can take over
+    the new configuration; without `successor` SIGHUP is a stop.
 
     The adapter of the old one is closed before the new one opens its own. The process, the status socket and,
     unless its section has changed, the open bus stay: frames sent meanwhile wait there.
@@ -158,6 +159,11 @@ class Service:
             log.info("reload: nothing has changed")
             self._notifier.ready()
             return
+        if self._successor is None and self.bridge.adopt(successor.config):
+            successor.close()
+            log.info("reload: the configuration has changed, the adapter stays open")
+            self._notifier.ready()
+            return
         log.info("reload: the configuration has changed, the adapter is opened anew")
         self._discard_successor()
         self._successor = successor
@@ -216,6 +222,6 @@ def _describe(bridge: Bridge, state: State, reason: str, *, bus_open: bool) -> s
         words = [adapter.type.upper(), identity.version or "", identity.serial_number or ""]
         but = f", but {reason}" if reason else ""
         return f"running: {' '.join(filter(None, words))} on {adapter.port}, {bridge.config.bus.channel}{but}"
-    if state is State.FAULT:
-        return f"fault: {reason}"
+    if state in {State.FAULT, State.BUS_OFF}:
+        return f"{state.value}: {reason}"
     return f"waiting: {reason}" if state in {State.WAITING, State.BACKOFF} and reason else ""

@@ -5,7 +5,8 @@ answer_time_ms {min, median, max: of the adapter's last answers to questions abo
 adapter {type, port, version, serial_number}, bus {interface, channel, open},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
 from the adapter; tx_retries: frames sent once more; tx_returned: frames the adapter handed back; tx_stops,
-rx_overruns: how often it said "stop", "I lost frames"; bus_off_restarts; error_frames: put on the bus;
+rx_overruns: how often it said "stop", "I lost frames"; reconnects: how often it ran again;
+bus_off_restarts; error_frames: put on the bus;
 tx_discarded: of tx_frames, those that did not leave the adapter's own buffer for so long that it was emptied;
 tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
 At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_READ).
@@ -14,7 +15,7 @@ At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_RE
 from __future__ import annotations
 
 import contextlib
-import json
+import grp
 import os
 import socket
 import stat
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 ANSWER_TIMEOUT_S = 5.0
 SYSTEM_DIRECTORY = Path("/run/can-bridge")
+GROUP = "can-bridge"  # systemd/can-bridge.sysusers
 # Reasons in tx_dropped for frames that were lost before the relay could read them.
 LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow", "bus-recv-failed")
 
@@ -66,7 +68,7 @@ class StatusServer:
             path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
             _clear_away(path)
             self._socket.bind(str(path))
-            path.chmod(0o666)  # who may look, may read: it takes no commands
+            _admit_group(path)
             self._inode = path.stat().st_ino
             self._socket.listen(16)
         except OSError as error:
@@ -82,6 +84,8 @@ class StatusServer:
         return self._socket.fileno()
 
     def on_readable(self) -> None:
+        import json  # noqa: PLC0415 - a bridge that nobody asks does without
+
         for connection in self._waiting():
             with connection, contextlib.suppress(OSError):  # who hangs up early gets nothing
                 connection.setblocking(False)
@@ -100,6 +104,14 @@ class StatusServer:
         with contextlib.suppress(OSError):
             if self.path.lstat().st_ino == self._inode:
                 self.path.unlink()
+
+
+def _admit_group(path: Path) -> None:
+    """For the owner and the service's group, if there is one, or the owner's."""
+    if os.geteuid() == 0:
+        with contextlib.suppress(KeyError):  # no such group: not installed as a service
+            os.chown(path, -1, grp.getgrnam(GROUP).gr_gid)
+    path.chmod(0o660)
 
 
 def _clear_away(path: Path) -> None:
@@ -125,6 +137,8 @@ def _clear_away(path: Path) -> None:
 
 def query(path: Path) -> dict[str, Any]:
     """The status of the bridge behind `path`. StatusError: none is running there."""
+    import json  # noqa: PLC0415 - as above
+
     data = b""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -133,6 +147,10 @@ def query(path: Path) -> dict[str, Any]:
             while chunk := client.recv(65536):
                 data += chunk
         status = json.loads(data)
+    except PermissionError as error:
+        group = _group_name(path.stat().st_gid)
+        msg = f"no permission for {path}: usermod -aG {group} USER, then log in again; or be root"
+        raise StatusError(msg) from error
     except (OSError, ValueError) as error:
         msg = f"no bridge answers on {path}: {error}"
         raise StatusError(msg) from error
@@ -140,6 +158,13 @@ def query(path: Path) -> dict[str, Any]:
         msg = f"what answers on {path} is no bridge"
         raise StatusError(msg)
     return status
+
+
+def _group_name(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
 
 
 def _reasons(dropped: dict[str, int]) -> str:

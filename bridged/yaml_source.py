@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Mapping
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
 import yaml
@@ -304,7 +304,7 @@ class Section:
             return
         node = self.nodes[key]
         is_number = type_.__origin__ in (int, float)
-        is_text = not is_number and type_.__origin__ is not bool
+        is_text = type_.__origin__ is str or get_origin(type_.__origin__) is Literal
         if isinstance(node, ScalarNode):
             value = node.value if is_text else scalar_value(node)
             if is_text and not node.value.isprintable():

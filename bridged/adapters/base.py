@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Generator
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from bridged.health import Observation
 
@@ -19,8 +18,7 @@ class Reply(enum.Enum):
     NONE = enum.auto()  # nothing, until Exchange.timeout_s
 
 
-@dataclass(frozen=True, slots=True)
-class Exchange:
+class Exchange(NamedTuple):
     """One request and the answers it can have. An answer in neither tuple is somebody else's."""
 
     request: bytes
@@ -33,16 +31,14 @@ class Exchange:
     opens: bool = False  # the channel: frames that come from now on are received
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(NamedTuple):
     """What came back for an exchange."""
 
     reply: Reply
     text: bytes = b""
 
 
-@dataclass(frozen=True, slots=True)
-class Polling:
+class Polling(NamedTuple):
     """A device that does not speak by itself is asked for frames this often."""
 
     request: bytes
@@ -50,8 +46,7 @@ class Polling:
     interval_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Flow:
+class Flow(NamedTuple):
     """How the window of a device works that does not answer frames: see Relay.set_flow."""
 
     request: bytes
@@ -61,8 +56,7 @@ class Flow:
     ready: int
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
+class Identity(NamedTuple):
     """Who the device says it is."""
 
     version: str | None = None

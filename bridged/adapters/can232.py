@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import re
 from typing import TYPE_CHECKING
@@ -212,7 +211,7 @@ class Can232:
             step = self._step(b"L\r", "open the channel in listen-only mode (L)")
         else:
             step = self._step(b"O\r", "open the channel (O)")
-        yield dataclasses.replace(step, opens=True)
+        yield step._replace(opens=True)
 
     def _auto_poll(self) -> Generator[Exchange, Answer, bool]:
         """Whether frames come by themselves: then A is refused (manual 2.0, A). X cannot be read."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 import re
@@ -303,7 +302,7 @@ class Usb2can:
         """Step 10. A listener that acknowledges, or a filter of the other kind, must not go unnoticed."""
         bits = self._mode_bits
         for step in self._write("MOD", MOD, bits):
-            yield dataclasses.replace(step, opens=True)
+            yield step._replace(opens=True)
         if not bits:
             return
         answer = yield _exchange(message(READ_REG, MOD), "tell register MOD", bytes((READ_REG, 2, MOD)))

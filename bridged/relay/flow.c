@@ -116,8 +116,7 @@ static void level_observe(struct relay *r, uint32_t level, uint32_t taken, int64
     f->level = level;
     if (left)
         f->left_at_ns = now;
-    int64_t limit = r->set.deadline_ns > STOP_LIMIT_NS ? r->set.deadline_ns : STOP_LIMIT_NS;
-    if (!level || now - f->left_at_ns <= limit) /* a slow, busy bus is no reason */
+    if (!level || now - f->left_at_ns <= stuck_ns(r))
         return;
     f->left_at_ns = NEVER; /* said once */
     relay_emit(r, EVENT_STUCK, level, NULL, 0);

@@ -1,14 +1,15 @@
-/* What the two files that know Python share. */
+/* What the files that know Python share. */
 #ifndef CAN_BRIDGE_MODULE_H
 #define CAN_BRIDGE_MODULE_H
 
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
-#include "codec.h"
+#include "relay.h"
 
 const struct codec *codec_by_name(const char *name); /* NULL with ValueError */
 PyObject *module_decode(PyObject *module, PyObject *args);
 PyObject *module_encode(PyObject *module, PyObject *args);
+PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64_t pending);
 
 #endif

@@ -1,6 +1,17 @@
 /* Frames from the bus that wait for the device: those not sent yet, and those it did not take. */
 #include "relay.h"
 
+#include <errno.h>
+#include <stdlib.h>
+
+#define STUCK_LEAST_NS INT64_C(500000000) /* a slow, busy bus is no reason */
+
+/* For how long no frame may leave the device's own buffer: what is in there is older than the deadline then. */
+int64_t stuck_ns(const struct relay *r)
+{
+    return r->set.deadline_ns > STUCK_LEAST_NS ? r->set.deadline_ns : STUCK_LEAST_NS;
+}
+
 static struct tx_frame *waiting_at(struct relay *r, uint32_t i)
 {
     return &r->queue[(r->queue_head + i) % r->set.queue];
@@ -70,6 +81,24 @@ void queue_add(struct relay *r, const struct can_frame *frame, int64_t born_ns, 
     tx->frame = *frame;
     tx->born_ns = born_ns;
     tx->number = r->next_number++;
+}
+
+/* Room for so many frames that were not sent yet; of those that wait the newest are dropped if it is too small. */
+int queue_resize(struct relay *r, uint32_t size)
+{
+    struct tx_frame *queue = malloc(size * sizeof *queue);
+    if (!queue)
+        return ENOMEM;
+    uint32_t kept = r->queue_count < size ? r->queue_count : size;
+    for (uint32_t i = 0; i < kept; i++)
+        queue[i] = *waiting_at(r, i);
+    for (; r->queue_count > kept; r->queue_count--)
+        queue_drop(r, TX_QUEUE_FULL);
+    free(r->queue);
+    r->queue = queue;
+    r->queue_head = 0;
+    r->set.queue = size;
+    return 0;
 }
 
 /* Frames that wait survive the adapter's absence until their deadline; nothing else does. */

@@ -73,7 +73,8 @@ enum event_kind {
     EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many retries so far. Not at each */
     EVENT_UNANSWERED,    /* an answer is missing: the line is being resynchronised */
     EVENT_SILENT,    /* not even the sync command is answered; nothing is sent until a new attach */
-    EVENT_STUCK,     /* frames are in the device's buffer and none has left it for the deadline; token: how many */
+    EVENT_STUCK,     /* frames are in the device's buffer and none has left it for stuck_ns(); token: how many,
+                        0: not known */
     EVENT_STAMPED,   /* a frame had a time stamp; said once per attach */
     EVENT_PORT_LOST, /* token: errno, 0 for end of file */
     EVENT_BUS_DOWN,  /* the interface is down */
@@ -193,6 +194,7 @@ struct relay {
     struct tx_frame retry[RETRY_MAX];
     uint32_t retry_head, retry_count;
     int64_t retry_at_ns, retry_delay_ns;
+    int64_t refused_ns; /* since when the device takes no frame; NEVER: it does */
     struct inflight inflight[INFLIGHT_MAX];
     uint32_t inflight_head, inflight_count;
     struct command commands[COMMANDS_MAX];
@@ -258,7 +260,9 @@ void queue_add(struct relay *r, const struct can_frame *frame, int64_t born_ns, 
 void queue_drop(struct relay *r, enum tx_drop reason);
 void queue_expire(struct relay *r, int64_t now);
 void queue_set_gate(struct relay *r, enum gate gate);
+int queue_resize(struct relay *r, uint32_t size); /* -> 0 or ENOMEM */
 bool queue_waiting(const struct relay *r);
+int64_t stuck_ns(const struct relay *r);
 struct tx_frame queue_pop(struct relay *r);
 void queue_retry(struct relay *r, const struct tx_frame *tx);
 void queue_overtake(struct relay *r, const struct tx_frame *taken);

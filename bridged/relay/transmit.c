@@ -67,6 +67,7 @@ void transmit_reset(struct relay *r)
     r->poll.length = 0;
     r->retry_delay_ns = RETRY_FIRST_NS;
     r->retry_at_ns = 0;
+    r->refused_ns = NEVER;
     flow_reset(r);
 }
 
@@ -92,10 +93,22 @@ static void frame_confirmed(struct relay *r, uint64_t number)
 {
     r->count.confirmed++;
     r->retry_delay_ns = RETRY_FIRST_NS;
+    r->refused_ns = NEVER;
     while (r->retry_count && retry_first(r)->number < number) {
         retry_pop(r);
         queue_drop(r, TX_OVERTAKEN);
     }
+}
+
+/* Where the device's buffer is full and takes nothing for so long, nothing has left it either. */
+static void look_if_stuck(struct relay *r, int64_t now)
+{
+    if (r->refused_ns == NEVER)
+        r->refused_ns = now;
+    if (now - r->refused_ns < stuck_ns(r))
+        return;
+    r->refused_ns = now;
+    relay_emit(r, EVENT_STUCK, 0, NULL, 0);
 }
 
 /* BELL says that the adapter did not take the frame: sending it again cannot double it. But a BELL may
@@ -115,6 +128,7 @@ static void frame_refused(struct relay *r, const struct tx_frame *tx, uint64_t n
     }
     if (r->retry_delay_ns == RETRY_FIRST_NS || r->count.retries % RETRIES_TOLD == 0)
         relay_emit(r, EVENT_FRAME_REFUSED, (uint32_t)r->count.retries, NULL, 0);
+    look_if_stuck(r, now);
     queue_retry(r, tx);
     if (!r->checking)
         r->check_noise = line_noise(r);

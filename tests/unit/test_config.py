@@ -129,7 +129,10 @@ def test_the_whole_schema(file: Path) -> None:
         path=file,
         adapter=Can232Config(type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number="A123"),
         channel=ChannelConfig(
-            timing=BitTiming(125_000), listen_only=False, acceptance=AcceptanceFilter(0x6000, 0x1FF0, False)
+            timing=BitTiming(125_000),
+            listen_only=False,
+            acceptance=AcceptanceFilter(0x6000, 0x1FF0, False),
+            restart_s=0.1,
         ),
         bus=BusConfig(interface="socketcan", channel="vcan0", create=True, options={}),
         transmit=TransmitConfig(queue=1024, window=1, deadline_s=1.0),
@@ -144,9 +147,26 @@ def test_defaults(file: Path) -> None:
     assert loaded.adapter == Can232Config(
         type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number=None
     )
-    assert loaded.channel == ChannelConfig(timing=BitTiming(125_000), listen_only=False, acceptance=None)
+    assert loaded.channel == ChannelConfig(
+        timing=BitTiming(125_000), listen_only=False, acceptance=None, restart_s=0.1
+    )
     assert loaded.bus == BusConfig(interface="socketcan", channel="vcan0", create=False, options={})
     assert loaded.transmit == TransmitConfig(queue=1024, window=1, deadline_s=1.0)
+
+
+@pytest.mark.parametrize(
+    ("adapter", "keys", "restart_s"),
+    [
+        ("{type: can232, port: /dev/x}", ", restart: 1", 0.001),
+        ("{type: can232, port: /dev/x}", ", restart: never", None),
+        ("{type: usb2can, port: /dev/x}", "", 0.0),
+        ("{type: usb2can, port: /dev/x}", ", restart: 60000", 60.0),
+        ("{type: usb2can, port: /dev/x}", ", restart: 'never'", None),
+    ],
+)
+def test_restart(file: Path, adapter: str, keys: str, restart_s: float | None) -> None:
+    file.write_text(four_lines(adapter, channel=f"{{bitrate: 125000{keys}}}"))
+    assert load(file).channel.restart_s == restart_s
 
 
 def test_usb2can(file: Path) -> None:
@@ -294,6 +314,7 @@ URL = "HOST:PORT with a PORT from 1 to 65535 is wanted, not"
 BAUDRATE = "a UART rate from 50 to 4000000 bit/s is wanted"
 BITRATE = "a bit rate from 10000 to 1000000 bit/s (a slower one by btr0 and btr1) is wanted"
 REGISTER = "a register value from 0x00 to 0xFF is wanted"
+RESTART = "a number of milliseconds from 1 to 60000, or never is wanted"
 SAMPLE_POINT = "a fraction of the bit time from 0.5 to 0.95 is wanted"
 WORD = "a number from 0x00000000 to 0xFFFFFFFF is wanted"
 NAME = "the name of an interface has"
@@ -378,6 +399,11 @@ SINGLE = "a single value, or a list of single values, is wanted"
         (channel, "bitrate: 125000, sample_point: 87.5", f"{SAMPLE_POINT}, not 87.5"),
         (channel, "bitrate: 125000, sample_point: .nan", f"{SAMPLE_POINT}, not the text '.nan'"),
         (channel, "bitrate: 125000, listen_only: 1", "true or false is wanted, not 1"),
+        (channel, "bitrate: 125000, restart: 0", f"{RESTART}, not 0"),
+        (channel, "bitrate: 125000, restart: 60001", f"{RESTART}, not 60001"),
+        (channel, "bitrate: 125000, restart: 1.5", f"{RESTART}, not 1.5"),
+        (channel, "bitrate: 125000, restart: off", f"{RESTART}, not the yes-or-no value 'off'"),
+        (channel, "bitrate: 125000, restart: 100 ms", f"{RESTART}, not the text '100 ms'"),
         (channel, "bitrate: 125000, acceptance: 3", "a section with code, mask, mode is wanted, not 3"),
         (bus, "channel: a234567890123456", f"{NAME} up to 15 characters, 'a234567890123456' has 16"),
         (bus, "channel: größe-größe-1", f"{NAME} up to 15 characters, 'größe-größe-1' has 17"),
@@ -413,7 +439,7 @@ def test_one_wrong_value(file: Path, section: Callable[[str], str], entry: str, 
 ADAPTER_KEYS = "type, port, baudrate, serial_number, critical_limit, ready_limit"
 CAN232_KEYS = "type, port, baudrate, serial_number"
 USB2CAN_KEYS = "type, port, serial_number, critical_limit, ready_limit"
-CHANNEL_KEYS = "bitrate, btr0, btr1, sample_point, listen_only, acceptance"
+CHANNEL_KEYS = "bitrate, btr0, btr1, sample_point, listen_only, acceptance, restart"
 BUS_KEYS = "interface, channel, create"
 SECTIONS = "sections adapter, channel and bus are wanted"
 NO_MAPPING = f"the file is no mapping (a 'key: value' in each line); {SECTIONS}"

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridged.health import BusState, Happened, Health, Observation, error_frame, state_of
+from bridged.health import BusState, Happened, Health, Observation, Stall, error_frame, state_of
 
 ACTIVE, WARNING, PASSIVE, BUS_OFF = BusState
 CRTL, BUSOFF, RESTARTED = 0x004, 0x040, 0x100
@@ -87,6 +87,35 @@ def test_an_adapter_that_is_away_has_no_state() -> None:
     health.forget()
     assert (health.state, health.tec, health.rec) == (None, None, None)
     assert len(health.observe(counted(100, 0), 1.0)) == 1
+
+
+ERRORS = Observation("", ACTIVE, lasting=False, happened=Happened.BUS_ERROR)
+ERRORS_PASSIVE = Observation("", PASSIVE, lasting=False, happened=Happened.BUS_ERROR)
+NO_ERRORS = Observation("", ACTIVE, lasting=False)
+
+
+def test_frames_that_do_not_leave_the_adapter() -> None:
+    """As where nobody acknowledges: passive is said once, bus errors each time."""
+    stall = Stall(1.0)
+    assert not stall.observe(NO_ERRORS, 0.0, 5, 7)
+    assert not stall.observe(ERRORS_PASSIVE, 0.25, 5, 8)
+    assert not stall.observe(ERRORS, 1.2, 5, 8)
+    assert stall.observe(ERRORS, 1.25, 5, 8)
+
+
+@pytest.mark.parametrize(
+    ("looks", "why"),
+    [
+        ([(ERRORS_PASSIVE, 5, 7), (ERRORS, 5, 7)], "it took no frame"),
+        ([(ERRORS_PASSIVE, 5, 8), (ERRORS, 6, 8)], "frames are received"),
+        ([(ERRORS_PASSIVE, 5, 8), (NO_ERRORS, 5, 8), (ERRORS, 5, 8)], "there was a look without errors"),
+        ([(ERRORS, 5, 8), (ERRORS, 5, 8)], "a noisy bus on which frames get through"),
+    ],
+)
+def test_frames_that_may_well_leave_the_adapter(looks: list[tuple[Observation, int, int]], why: str) -> None:
+    stall = Stall(1.0, 5, 7)
+    for at, (seen, rx_frames, tx_frames) in enumerate(looks):
+        assert not stall.observe(seen, 2.0 * at, rx_frames, tx_frames), why
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255)), max_size=30))

@@ -24,20 +24,23 @@ from bridged.lifecycle import (
 )
 
 # Events that a state can meet, and no others: RELEASE drops what the relay still had to say, a timer is set
-# in three states only, and nobody looks out for the device before the start.
-ALWAYS = {Event.STOP, Event.APPEARED}
+# in four states only, and nobody looks out for the device before the start.
+ALWAYS = {Event.STOP, Event.APPEARED, Event.RESTART}
+FAILED = {Event.PORT_LOST, Event.SILENT, Event.BUS_OFF}
 POSSIBLE = {
-    State.IDLE: {Event.START, Event.STOP},
+    State.IDLE: {Event.START, Event.STOP, Event.RESTART},
     State.WAITING: ALWAYS | {Event.TIMER},
     State.OPENING: ALWAYS | {Event.OPENED, Event.ABSENT, Event.OPEN_FAILED},
     State.INITIALISING: ALWAYS | {Event.READY, Event.UNANSWERED, Event.REFUSED, Event.PORT_LOST},
-    State.RUNNING: ALWAYS | {Event.SILENT, Event.PORT_LOST},
-    State.REJECTING: ALWAYS | {Event.CLOSED, Event.SILENT, Event.PORT_LOST},
-    State.CLOSING: ALWAYS | {Event.CLOSED, Event.SILENT, Event.PORT_LOST},
-    State.BACKOFF: ALWAYS | {Event.TIMER, Event.PORT_LOST, Event.SILENT},
-    State.FAULT: ALWAYS | {Event.TIMER, Event.PORT_LOST, Event.SILENT},
-    State.STOPPING: ALWAYS | {Event.CLOSED, Event.SILENT, Event.PORT_LOST},
-    State.STOPPED: ALWAYS | {Event.OPENED, Event.ABSENT, Event.OPEN_FAILED, Event.PORT_LOST, Event.SILENT},
+    State.RUNNING: ALWAYS | FAILED,
+    State.REJECTING: ALWAYS | FAILED | {Event.CLOSED},
+    State.CLOSING: ALWAYS | FAILED | {Event.CLOSED},
+    State.LEAVING: ALWAYS | FAILED | {Event.CLOSED},
+    State.BACKOFF: ALWAYS | FAILED | {Event.TIMER},
+    State.FAULT: ALWAYS | FAILED | {Event.TIMER},
+    State.BUS_OFF: ALWAYS | FAILED,
+    State.STOPPING: ALWAYS | FAILED | {Event.CLOSED, Event.TIMER},
+    State.STOPPED: ALWAYS | FAILED | {Event.OPENED, Event.ABSENT, Event.OPEN_FAILED},
 }
 
 
@@ -51,7 +54,7 @@ def test_every_pair_is_decided(state: State, event: Event) -> None:
     if (state, event) in IGNORED:
         assert (after, actions) == (state, ())
     elif after is not state:
-        assert actions
+        assert actions or (state, after) == (State.LEAVING, State.CLOSING)
 
 
 def test_ignored_and_decided_do_not_overlap() -> None:
@@ -64,6 +67,9 @@ def test_stop_leads_to_the_end(state: State) -> None:
     if after is State.STOPPING:
         for event in (Event.CLOSED, Event.PORT_LOST):
             assert transition(after, event) == (State.STOPPED, (Action.RELEASE, Action.FINISH))
+        assert Action.LIMIT in actions or state is State.STOPPING  # however long the adapter takes
+        after, actions = transition(after, Event.TIMER)
+        assert (after, actions[-2:]) == (State.STOPPED, (Action.RELEASE, Action.FINISH))
     else:
         assert (after, actions) == (State.STOPPED, (Action.FINISH,))
 
@@ -140,7 +146,7 @@ def test_what_was_told_long_ago_is_forgotten() -> None:
 
 # --- the whole, in simulated time -------------------------------------------------------------
 
-OPEN_S, STEP_S, SILENCE_S = 0.01, 0.05, 0.5
+OPEN_S, STEP_S, SILENCE_S, STOP_S = 0.01, 0.05, 0.5, 1.5
 INITIAL_S, MAXIMUM_S = 0.1, 5.0
 
 
@@ -198,7 +204,15 @@ class World(RuleBasedStateMachine):
     def do_close(self) -> None:
         assert self.port_open
         self.gates_open = False
-        self.result = self.now + STEP_S, Event.CLOSED
+        slow = self.state is State.STOPPING and not self.answers
+        self.result = self.now + (10 * STOP_S if slow else STEP_S), Event.CLOSED
+
+    def do_limit(self) -> None:
+        assert self.timer is None, "two timers"
+        self.timer = self.now + STOP_S
+
+    def do_last_words(self) -> None:
+        assert self.port_open
 
     def do_release(self) -> None:
         self.port_open = self.gates_open = False
@@ -305,6 +319,16 @@ class World(RuleBasedStateMachine):
     def reset_behind_our_back(self) -> None:
         self.dispatch(Event.SILENT)
 
+    @rule()
+    @precondition(lambda self: self.state is State.RUNNING)
+    def bus_off_and_not_to_be_restarted(self) -> None:
+        self.dispatch(Event.BUS_OFF)
+
+    @rule()
+    def interface_comes_up(self) -> None:
+        self.pushed = self.pushed or self.state is State.BUS_OFF
+        self.dispatch(Event.RESTART)
+
     @rule(late=st.sampled_from([Event.APPEARED, Event.STOP]))
     @precondition(lambda self: self.state in {State.STOPPING, State.STOPPED})
     def late_news(self, late: Event) -> None:
@@ -320,10 +344,11 @@ class World(RuleBasedStateMachine):
     @invariant()
     def one_thing_at_a_time(self) -> None:
         pausing = self.state in {State.WAITING, State.BACKOFF, State.FAULT}
-        assert (self.timer is not None) == pausing == self.looking_out
+        assert pausing == self.looking_out
+        assert (self.timer is not None) == (pausing or self.state is State.STOPPING)
         assert self.gates_open == (self.state is State.RUNNING)
         assert self.opening == (self.state is State.OPENING) or self.finished
-        closed = {State.IDLE, State.OPENING, State.WAITING, State.BACKOFF, State.FAULT}
+        closed = {State.IDLE, State.OPENING, State.WAITING, State.BACKOFF, State.FAULT, State.BUS_OFF}
         assert not (self.state in closed and self.port_open)
         assert self.finished == (self.state is State.STOPPED)
 
@@ -331,10 +356,11 @@ class World(RuleBasedStateMachine):
         """Whatever happened: with a good device it runs within the longest pause, and it can be stopped."""
         if not self.finished and self.state is not State.STOPPING:
             self.present = self.openable = self.answers = self.right = True
+            self.interface_comes_up()
             self.pass_time(MAXIMUM_S + 2 * (OPEN_S + 2 * STEP_S))
             assert self.state is State.RUNNING, self.state
             self.dispatch(Event.STOP)
-        self.pass_time(1.0)
+        self.pass_time(STOP_S)
         assert self.finished
 
 

@@ -2,7 +2,7 @@
 
 from bridged.adapters.base import Answer, Exchange, HealthSteps, Reply
 from bridged.errors import AdapterError
-from bridged.health import BusState, Observation
+from bridged.health import BusState, Happened, Observation, error_frame
 from bridged.polling import HealthPolling
 
 
@@ -31,13 +31,16 @@ class Bench:
         self.asked: list[object] = []
         self.told: list[bytes] = []
         self.failed: list[str] = []
-        self.counters = {"rx_overruns": 0, "rx_frames": 0, "tx_frames": 0}
+        self.off: list[str] = []
+        self.counters = {"rx_overruns": 0, "rx_frames": 0, "tx_frames": 0, "decoded": 0}
         self.polling = HealthPolling(
             self.adapter,  # type: ignore[arg-type]
             0.25,
             ask=lambda _exchange, then: self.asked.append(then),
             tell=self.told.append,
             failed=self.failed.append,
+            bus_off=self.off.append,
+            stuck_s=0.0,
             counters=lambda: self.counters,
         )
         self.polling.start(0.0)
@@ -45,6 +48,12 @@ class Bench:
 
     def answer(self) -> None:
         self.asked.pop(0)(Answer(Reply.TEXT))  # type: ignore[operator]
+
+    def look(self) -> None:
+        """A whole round."""
+        self.polling.on_timer(1e9)
+        for _ in range(2):
+            self.answer()
 
 
 def test_one_question_at_a_time_and_the_next_round_only_after_the_last_answer() -> None:
@@ -87,6 +96,36 @@ def test_what_says_that_it_must_be_initialised_again() -> None:
     bench.answer()
     assert bench.failed == ["channel closed"]
     assert bench.polling.next_at is None
+
+
+def test_bus_off_is_told_once() -> None:
+    bench = Bench()
+    bench.adapter.seen = Observation("bus-off", BusState.BUS_OFF, tec=127, rec=0)
+    for _ in range(3):
+        bench.look()
+    assert bench.off == ["bus-off"]
+
+
+def test_one_that_cannot_tell_bus_off_is_taken_for_it_when_nothing_seems_to_leave_it() -> None:
+    bench = Bench()
+    bench.look()
+    bench.adapter.seen = Observation(
+        "bus error", BusState.ERROR_PASSIVE, lasting=False, happened=Happened.BUS_ERROR
+    )
+    bench.look()
+    assert bench.off == []  # it has no frame of ours
+    bench.counters["tx_frames"] = 1
+    bench.look()
+    assert len(bench.off) == 1
+    assert bench.off[0].startswith("bus error for 0 s, and nothing is received")
+
+
+def test_restart_is_told_to_the_bus() -> None:
+    bench = Bench()
+    bench.polling.stop()
+    bench.polling.start(0.0, restarted=True)
+    assert bench.told == [error_frame(0x100)]
+    assert bench.polling.health.restarts == 1
 
 
 def test_an_answer_after_the_end_means_nothing() -> None:

@@ -222,7 +222,7 @@ class TestReload:
 
         def change() -> None:
             buses.append(first._bus_end.bus)
-            write_config(file, bus=file.parent.name, deadline=2.0)
+            write_config(file, port="/nowhere/other", bus=file.parent.name)
             os.kill(os.getpid(), signal.SIGHUP)
 
         def stop() -> None:
@@ -231,10 +231,30 @@ class TestReload:
 
         self.run(made, [change, stop], heard)
         assert made.bridge is not first
-        assert made.bridge.config.transmit.deadline_s == 2.0
+        assert made.bridge.config.adapter.port == "/nowhere/other"
         assert buses[0] is buses[1]
         assert sum("bus open" in message for message in caplog.messages) == 1
         assert first.filenos()[1] == -1  # nothing of the first is left open
+
+    def test_the_adapter_stays_open_if_it_need_not_know(
+        self, running: tuple[Service, Path, list[str]], caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level(logging.INFO)
+        made, file, heard = running
+        first = made.bridge
+
+        def change() -> None:
+            text = write_config(file, bus=file.parent.name, deadline=2.0).read_text()
+            settings = "health: {interval: 0.5}\nreconnect: {initial: 2.0}\n"
+            file.write_text(text.replace("}\nbus", ", restart: never}\nbus") + settings)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+        self.run(made, [change, lambda: os.kill(os.getpid(), signal.SIGTERM)], heard)
+        assert made.bridge is first
+        assert "reload: the configuration has changed, the adapter stays open" in caplog.messages
+        config = first.config
+        assert (config.transmit.deadline_s, config.health.interval_s) == (2.0, 0.5)
+        assert (config.reconnect.initial_s, config.channel.restart_s) == (2.0, None)
 
     def test_another_bus_is_opened(self, running: tuple[Service, Path, list[str]]) -> None:
         made, file, heard = running
@@ -252,14 +272,14 @@ class TestReload:
         first = made.bridge
 
         def both() -> None:
-            write_config(file, deadline=2.0)
+            write_config(file, port="/nowhere/other")
             os.kill(os.getpid(), signal.SIGHUP)
             os.kill(os.getpid(), signal.SIGTERM)
 
         self.run(made, [both], heard)
         assert made.bridge.finished
         assert heard[-1] == "STATUS=stopping"
-        assert made.bridge is first or made.bridge.config.transmit.deadline_s == 2.0
+        assert made.bridge is first or made.bridge.config.adapter.port == "/nowhere/other"
 
     def test_without_a_successor_sighup_stops(self, tmp_path: Path) -> None:
         file = write_config(tmp_path / "one.yaml", bus=tmp_path.name)

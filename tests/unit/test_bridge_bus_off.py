@@ -1,0 +1,179 @@
+"""Bus-off and what looks like it: `channel.restart`, and what waits in the adapter's buffer meanwhile."""
+
+import contextlib
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_bridge import FRAME, Bench, run_until, started, stopped
+from test_bridge_usb2can import Usb2canBench
+
+from bridged import bridge as bridge_module
+from bridged.bridge import Bridge
+from bridged.health import CAN_ERR_RESTARTED, BusState, error_frame
+from bridged.lifecycle import Event, State
+from bridged.simulators.can232 import Can232
+
+OLD, NEW = 0x100, 0x1FFFFFFF
+EFF_FLAG = 0x80000000
+DEADLINE_S = 0.5
+TRANSMIT = f"{{deadline: {DEADLINE_S}}}"
+
+
+@pytest.fixture
+def can232(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path, monkeypatch)) as bench:
+        yield bench
+
+
+@pytest.fixture
+def usb2can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Usb2canBench]:
+    with contextlib.closing(Usb2canBench(tmp_path, monkeypatch)) as bench:
+        yield bench
+
+
+def send(bench: Bench, can_id: int, count: int = 1) -> None:
+    for n in range(count):
+        bench.bus.far.send(FRAME.pack(EFF_FLAG | can_id, 1, bytes([n])))
+
+
+def frames_on_bus(bench: Bench) -> list[bytes]:
+    """What a program on the bus has got."""
+    frames = []
+    bench.bus.far.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while frame := bench.bus.far.recv(16):
+            frames.append(frame)
+    return frames
+
+
+def heals(bench: Bench, bridge: Bridge, device: Can232, born: list[float]) -> None:
+    """The bus is good again; of what was sent while it was not, nothing comes that is too old."""
+    run_until(bridge, lambda: bridge.state not in {State.RUNNING, State.CLOSING})
+    oldest = time.monotonic() - DEADLINE_S
+    device.set_bus_off(time.monotonic(), False)
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    send(bench, NEW)
+    run_until(bridge, lambda: any(frame.can_id == NEW for frame in bench.frames))
+    status = stopped(bridge)
+    *before, last = bench.frames
+    assert last.can_id == NEW
+    assert all(born[frame.can_id - OLD] > oldest for frame in before)
+    assert error_frame(CAN_ERR_RESTARTED) in frames_on_bus(bench)
+    assert status["counters"]["bus_off_restarts"] == status["counters"]["reconnects"] >= 1
+
+
+def test_a_can232_that_refuses_everything_is_restarted(can232: Bench) -> None:
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge(transmit=TRANSMIT, more="health: {interval: 0.5}"))
+    device.set_bus_off(time.monotonic(), True)
+    born: list[float] = []
+
+    def refused() -> bool:
+        """The buffer is full at once; something is sent all the time."""
+        send(can232, OLD + len(born), 40)
+        born.append(time.monotonic())
+        return bridge.state is not State.RUNNING
+
+    run_until(bridge, refused)
+    assert "its status: " in bridge.reason or "nothing is received" in bridge.reason
+    heals(can232, bridge, device, born)
+
+
+def test_a_can232_with_a_few_frames_that_nobody_acknowledges_is_restarted(can232: Bench) -> None:
+    """Its buffer is not full, so it refuses nothing: its flags are all there is to see."""
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge(transmit=TRANSMIT))
+    device.set_bus_off(time.monotonic(), True)
+    send(can232, OLD, 3)
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == 3)
+    run_until(bridge, lambda: bridge.state is not State.RUNNING)
+    assert "nothing is received" in bridge.reason
+    heals(can232, bridge, device, [0.0])
+
+
+@pytest.mark.parametrize("event", [Event.RESTART, Event.STOP])
+def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(can232: Bench, event: Event) -> None:
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge("bitrate: 125000, restart: never", TRANSMIT))
+    device.set_bus_off(time.monotonic(), True)
+    send(can232, OLD, 3)
+    run_until(bridge, lambda: bridge.state is State.BUS_OFF)
+    assert "channel.restart is never: ip link set vcan0 down, then up" in bridge.reason
+    device.set_bus_off(time.monotonic(), False)
+    send(can232, OLD)
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["adapter-away"] == 1)
+    assert (bridge.state, bridge.next_timer()) == (State.BUS_OFF, None)
+    if event is Event.RESTART:
+        bridge._dispatch(event)
+        run_until(bridge, lambda: bridge.state is State.RUNNING)
+    stopped(bridge)
+    assert can232.frames == []
+
+
+def test_a_usb2can_restarts_itself(usb2can: Usb2canBench) -> None:
+    device = usb2can.device_plugged_in()
+    bridge = started(usb2can.bridge())
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.ERROR_ACTIVE.text)
+    device.set_bus_off(time.monotonic(), True)
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.BUS_OFF.text)
+    device.set_bus_off(time.monotonic(), False)
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.ERROR_ACTIVE.text)
+    counters = stopped(bridge)["counters"]
+    assert (counters["bus_off_restarts"], counters["reconnects"]) == (1, 0)
+
+
+@pytest.mark.parametrize("restart", ["50", "never"])
+def test_a_usb2can_is_taken_off_the_bus_if_it_is_not_to_restart_itself(
+    usb2can: Usb2canBench, restart: str
+) -> None:
+    device = usb2can.device_plugged_in()
+    bridge = started(usb2can.bridge(f"bitrate: 500000, restart: {restart}"))
+    device.set_bus_off(time.monotonic(), True)
+    run_until(bridge, lambda: bridge.state in {State.BACKOFF, State.BUS_OFF})
+    assert device.chip.in_reset
+    assert bridge.state is (State.BUS_OFF if restart == "never" else State.BACKOFF)
+    device.set_bus_off(time.monotonic(), False)
+    if restart == "never":
+        bridge._dispatch(Event.RESTART)
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    assert (error_frame(CAN_ERR_RESTARTED) in frames_on_bus(usb2can)) == (restart != "never")
+    stopped(bridge)
+
+
+def test_an_adapter_that_does_not_answer_cannot_delay_the_end(
+    can232: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """On a slow line answers may take longer than anybody waits; what closes it is sent all the same."""
+    monkeypatch.setattr(bridge_module, "STOP_S", 0.05)
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge())
+    device.silent = True
+    stopped(bridge)
+    assert "the adapter did not answer in time: its channel may still be open" in caplog.messages
+    can232.pull_out()
+    assert not device._is_open()
+
+
+def test_frames_go_on_while_settings_change(can232: Bench) -> None:
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge())
+    ids = itertools.count(1)
+    for transmit in ("{deadline: 3.0}", "{queue: 12, deadline: 3.0}", "{queue: 2000}"):
+        send(can232, next(ids), 4)
+        other = can232.bridge(transmit=transmit)
+        assert bridge.adopt(other.config)
+        other.close()
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == 12)
+    other = can232.bridge(transmit="{window: 2}")
+    assert not bridge.adopt(other.config)
+    other.close()
+    stopped(bridge)
+    assert [frame.can_id for frame in can232.frames] == [1] * 4 + [2] * 4 + [3] * 4
