@@ -1,11 +1,13 @@
 """Bus states of a simulated adapter as a real candump shows them, in its words for the kernel's drivers."""
 
 import re
+import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rig import Process, Rig
+from rig import Process, Rig, wait_until
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -13,12 +15,11 @@ ADAPTERS: dict[str, dict[str, Any]] = {"can232": {"baudrate": 115200}, "usb2can"
 BACK = "controller-problem{back-to-error-active}"
 
 
-def configuration(adapter: str, port: Path, bus: str, **health: Any) -> dict[str, Any]:
+def configuration(adapter: str, port: Path, bus: str, **channel: Any) -> dict[str, Any]:
     return {
         "adapter": {"type": adapter, "port": str(port)} | ADAPTERS[adapter],
-        "channel": {"bitrate": 500_000},
+        "channel": {"bitrate": 500_000} | channel,
         "bus": {"channel": bus},
-        "health": health,
     }
 
 
@@ -64,3 +65,35 @@ def test_can232_says_what_happened(rig: Rig) -> None:
         "controller-problem{rx-error-passive,tx-error-passive}",
         BACK,
     ]
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS)
+def test_bus_off_until_the_interface_is_up_again(rig: Rig, adapter: str) -> None:
+    """`channel.restart: never`. A CAN232 cannot tell: a frame that does not leave it tells."""
+    near, far = rig.vcan(), rig.vcan()
+    dump = rig.start("candump", "-e", f"{near},0~0,#FFFFFFFF")
+    _, port = rig.simulate(far, "--fault", "busoff@25+10", adapter=adapter)
+    good_again = time.monotonic() + 25 + 10
+    bridge = rig.bridge(configuration(adapter, port, near, restart="never"))
+    bridge.wait_state("running")
+    arrived = rig.candump(far)
+
+    def off() -> bool:
+        rig.cansend(near, "123#01")
+        return "state=leaving" in bridge.err
+
+    bridge.wait_ready(off, "bus-off")
+    status = bridge.wait_state("bus-off")
+    assert f"channel.restart is never: ip link set {near} down, then up" in status["reason"]
+    before = arrived.count
+    rig.cansend(near, "123#02")
+    bridge.wait_status(lambda s: s["counters"]["tx_dropped"]["adapter-away"] >= 1, "the frame to be dropped")
+    wait_until(lambda: time.monotonic() > good_again, "a good bus")
+    for state in ("down", "up"):
+        subprocess.run(["ip", "link", "set", near, state], check=True)
+        bridge.wait_ready(lambda s=state: f"{near} is {s}" in bridge.err, f"{near} to be {state}")  # type: ignore[misc]
+    bridge.wait_state("running")
+    wait_until(lambda: arrived.count > before or not rig.cansend(near, "123#03"), "a frame to arrive")
+    assert not {"123#01", "123#02"} & set(arrived.frames[before:])
+    assert ("bus-off" in explained(dump)) == (adapter == "usb2can")
+    bridge.stop_cleanly()

@@ -203,6 +203,10 @@ class TestUnit:
         pid, index = can232.pid, Path(f"/sys/class/net/{can232.interface}/ifindex").read_text()
         can232.configure(NAMED / "RIG0001", queue=77)
         can232.systemctl("reload")
+        wait_until(lambda: "the adapter stays open" in can232.log(), "the new settings")
+        assert can232.log().count("state=running") == 1
+        can232.configure(NAMED / "RIG0001", queue=77, window=2)
+        can232.systemctl("reload")
         wait_until(lambda: can232.log().count("state=running") == 2, "it to run again")
         wait_until(lambda: can232.show("ActiveState") == "active", "the end of the reload")
         can232.wait_status("running: ")
@@ -246,8 +250,12 @@ class TestUnit:
             made.systemctl("start")
         one.systemctl("stop")
         assert two.socket.is_socket()
-        user = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups")
-        assert "two: " in execute(*user, "can-bridge", "status", "two", status=3)
+        user = ("setpriv", "--reuid=nobody", "--regid=nogroup")
+        asked = execute(*user, "--clear-groups", "can-bridge", "status", "two", status=3)
+        assert asked == f"can-bridge: no permission for {two.socket}: " + (
+            "usermod -aG can-bridge USER, then log in again; or be root"
+        )
+        assert "two: " in execute(*user, "--groups=can-bridge", "can-bridge", "status", "two", status=3)
 
     def test_raw_usb(self, rig: Rig, instance: Callable[[str], Instance]) -> None:
         chip = rig.chip("ftdi0")
