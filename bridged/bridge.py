@@ -12,6 +12,7 @@ import logging
 import os
 import queue
 import random
+import re
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -20,11 +21,13 @@ from msgspec.structs import replace
 
 from bridged import _relay
 from bridged.adapters import make_adapter
-from bridged.bus_end import BusEnd, repeated
+from bridged.bus_end import BusEnd
+from bridged.bus_off import BusOff, stuck_s
 from bridged.buses import open_bus
 from bridged.errors import PortError
 from bridged.exchanges import REPLIES, Exchanges
-from bridged.lifecycle import Action, Backoff, Event, State, Told, transition
+from bridged.health import BusState
+from bridged.lifecycle import Action, Backoff, Event, State, Told, repeated, transition
 from bridged.polling import HealthPolling
 from bridged.ports import open_port
 from bridged.ports.watch import Watch
@@ -40,19 +43,12 @@ log = logging.getLogger(__name__)
 
 UNANSWERED_LOG_S = 10.0
 LAST_WORDS_S = 0.1
-STOP_S = 1.5  # for an adapter that does not answer; systemd and users wait for the end
-STUCK_LEAST_S = 0.5  # as STUCK_LEAST_NS in queue.c
+STOP_S = 1.2  # for an adapter that does not answer; systemd and users wait for the end
 
 # States that end at once when the device is plugged in.
 LOOKING_OUT = frozenset({State.WAITING, State.BACKOFF, State.FAULT})
 # Their reason is that of the failure before.
 AFTERMATH = LOOKING_OUT | {State.BUS_OFF}
-
-
-ANEW = (
-    "; the channel is closed and opened anew, which throws away what is in the adapter's buffer, "
-    "so that nothing is sent late"
-)
 
 
 def _reason(error: int) -> str:
@@ -87,10 +83,9 @@ class Bridge:
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._opening = False  # a thread opens the port
-        self._discarded = 0
         self._starts = 0  # how often it began to run
-        self._restart_pause_s = 0.0  # as long as bus-off is to last at least
-        self._restarting = False  # after bus-off
+        self._identity: object = None  # that was told
+        self._bus_off = BusOff(config, self.adapter, self._dispatch)
         self._unanswered_log_at = 0.0
         self._turns: object = None  # of the relay, when they were looked at last
         sync = self.adapter.sync
@@ -112,7 +107,7 @@ class Bridge:
             tell=self._bus_end.put_error_frame,
             failed=lambda reason: self._dispatch(Event.SILENT, reason),
             bus_off=self._on_bus_off,
-            stuck_s=self._stuck_s,
+            stuck_s=stuck_s(config),
             counters=self._relay.counters,
         )
         self._thread = threading.Thread(target=self._relay.run, name="relay")
@@ -183,8 +178,16 @@ class Bridge:
         self.config = config
         self._relay.set_queue(transmit.queue, transmit.deadline_s)
         self._bus_end.adopt(config)
-        self._polling.adopt(config.health.interval_s, self._stuck_s)
+        self._bus_off.config = config
+        self._polling.adopt(config.health.interval_s, stuck_s(config))
         self._backoff.adopt(config.reconnect.initial_s, config.reconnect.maximum_s)
+        now = time.monotonic()
+        if self.state in LOOKING_OUT and self._timer is not None:
+            self._timer = min(self._timer, now + self._backoff.next_s(now))
+        if channel.restart_s is not None:
+            self._dispatch(Event.RESTART)
+        if self._polling.health.state is BusState.BUS_OFF:
+            self._on_bus_off("bus-off")
         return True
 
     def condition(self) -> tuple[State, str, bool]:
@@ -233,7 +236,7 @@ class Bridge:
                 "bus_off_restarts": health.restarts,
                 **health.happened,
                 **self._bus_end.error_frames,
-                "tx_discarded": self._discarded,
+                "tx_discarded": self.adapter.discarded,
                 **counters,
             },
             "queued": queued,
@@ -261,7 +264,8 @@ class Bridge:
     def _log_transition(self, reason: str) -> None:
         """One line; retries, and what is repeated too often, for those who look for a fault only."""
         self.reason = reason or (self.reason if self.state in AFTERMATH else "")
-        times = self._told.tell(reason, time.monotonic()) if reason else None
+        cause = re.sub(r"\d+", "#", reason)  # counts differ from time to time
+        times = self._told.tell(cause, time.monotonic()) if reason else None
         if times is not None:
             log.warning("state=%s: %s%s", self.state.value, reason, repeated(times))
             return
@@ -296,8 +300,8 @@ class Bridge:
             case Action.RELEASE:
                 self._release()
             case Action.WAIT:
-                pause_s, self._restart_pause_s = self._restart_pause_s, 0.0
-                self._wait(max(pause_s, self._backoff.next_s(time.monotonic())))
+                pause_s = self._bus_off.take_pause_s()
+                self._wait(self._backoff.next_s(time.monotonic()) if pause_s is None else pause_s)
             case Action.WAIT_LONG:
                 self._wait(self._backoff.longest_s())
             case Action.HURRY:
@@ -356,11 +360,12 @@ class Bridge:
         listen_only = self.config.channel.listen_only
         gate = _relay.GATE_LISTEN_ONLY if listen_only else _relay.GATE_OPEN
         self._relay.set_gates(receiving=True, transmit=gate)
-        self._polling.start(time.monotonic(), restarted=self._restarting)
-        self._restarting = False
+        self._polling.start(time.monotonic(), restarted=self._bus_off.take_restarting())
         self._starts += 1
         identity = self.adapter.identity
-        log.info("adapter version=%s serial_number=%s", identity.version, identity.serial_number)
+        if identity != self._identity:
+            self._identity = identity
+            log.info("adapter version=%s serial_number=%s", identity.version, identity.serial_number)
 
     def _close_channel(self) -> None:
         self._polling.stop()
@@ -370,6 +375,7 @@ class Bridge:
         self._exchanges.run(self.adapter.close_steps(), Event.CLOSED)
 
     def _release(self) -> None:
+        self._bus_off.closed()
         self._polling.stop()
         self._exchanges.forget()
         self._relay.detach_port()
@@ -461,31 +467,10 @@ class Bridge:
             self._unanswered_log_at = now + UNANSWERED_LOG_S
             log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", resyncs)
 
-    @property
-    def _stuck_s(self) -> float:
-        return max(self.config.transmit.deadline_s, STUCK_LEAST_S)
-
     def _on_stuck(self, frames: int) -> None:
-        """What waits in the adapter's own buffer would be sent whenever the bus lets it, however old."""
-        if self.state is not State.RUNNING:
-            return
-        self._discarded += frames
-        cause = f"no frame has left the adapter for {self._stuck_s:g} s (does another node acknowledge them?)"
-        if self.adapter.flow is None:  # it cannot tell bus-off
-            self._on_bus_off(f"{cause}, its status: {self._polling.description}")
-        else:
-            self._dispatch(Event.SILENT, f"{cause}{ANEW}")
+        if self.state is State.RUNNING:
+            self._bus_off.stuck(frames, self._polling)
 
     def _on_bus_off(self, cause: str) -> None:
-        """It is, or cannot tell whether it is."""
-        restart_s = self.config.channel.restart_s
-        if self.state is not State.RUNNING or restart_s == 0.0:
-            return
-        if restart_s is None:
-            interface = self.config.bus.channel
-            advice = f"ip link set {interface} down, then up, puts it on the bus again"
-            self._dispatch(Event.BUS_OFF, f"{cause}; channel.restart is never: {advice}")
-            return
-        self._restart_pause_s = restart_s
-        self._restarting = True
-        self._dispatch(Event.SILENT, f"{cause}{ANEW}")
+        if self.state is State.RUNNING:
+            self._bus_off.off(cause)

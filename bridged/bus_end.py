@@ -10,7 +10,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from bridged.errors import BusError
-from bridged.lifecycle import Told
+from bridged.lifecycle import Told, repeated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,8 +143,3 @@ class BusEnd:
         self.reason = ""
         log.log(logging.DEBUG if self._told.quiet else logging.INFO, "%s", text)
         self._told.well()
-
-
-def repeated(times: int) -> str:
-    """For a log line: what Told.tell() returned."""
-    return f" ({times} times since this was told last)" if times > 1 else ""

@@ -24,6 +24,10 @@ CAN_ERR_BUSOFF, CAN_ERR_BUSERROR, CAN_ERR_RESTARTED = 0x040, 0x080, 0x100
 CRTL_RX_OVERFLOW, CRTL_ACTIVE = 0x01, 0x40
 CRTL_RX_WARNING, CRTL_TX_WARNING, CRTL_RX_PASSIVE, CRTL_TX_PASSIVE = 0x04, 0x08, 0x10, 0x20
 
+LARGEST_BUFFER = 64
+"""Frames. More than a CAN232 (8) or any clone has room for."""
+STALL_LOOKS = 3
+
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame
 
 
@@ -44,6 +48,7 @@ class Happened(enum.Flag):
     """What can have happened since the last look."""
 
     NOTHING = 0
+    TX_FULL = enum.auto()
     RX_OVERFLOW = enum.auto()
     ARBITRATION_LOST = enum.auto()
     BUS_ERROR = enum.auto()
@@ -82,6 +87,7 @@ class Health:
         self.rec: int | None = None
         self.restarts = 0  # after bus-off
         self.happened: dict[str, int] = {}
+        self._told = BusState.ERROR_ACTIVE  # to the bus
         self._seen_s = 0.0  # when `state` was seen last, where it is not lasting
 
     def forget(self) -> None:
@@ -114,7 +120,9 @@ class Health:
                 return False
             self._seen_s = now_s
         self.state = state
-        return state != (BusState.ERROR_ACTIVE if before is None else before)
+        news = state != self._told
+        self._told = state
+        return news
 
     def _state_frame(self) -> bytes:
         """As can_change_state() fills it: both directions where it is not known which has the errors."""
@@ -134,30 +142,35 @@ class Health:
 class Stall:
     """Whether frames stay in the transmit buffer of a device that cannot tell how full it is.
 
-    That is taken for certain when there were bus errors at each look for `limit_s`, error-passive among them,
-    nothing was received meanwhile, and it has taken frames since the last look that found no errors.
+    That is taken for certain when it was error-passive (its flag says so once), has received nothing since
+    for `limit_s`, and has in that time, or just before, taken frames that may still be in its buffer.
     The frames are counters of those received and taken.
     """
 
     def __init__(self, limit_s: float, rx_frames: int = 0, tx_frames: int = 0) -> None:
         self.limit_s = limit_s
         self._since_s: float | None = None
-        self._passive = False
+        self._looks = 0
         self._rx_frames = rx_frames
-        self._tx_frames = tx_frames  # when all was well
+        # As of the look before the last good one: what was taken since then may not be on the bus yet.
+        self._tx_left = self._tx_seen = tx_frames
 
     def observe(self, seen: Observation, now_s: float, rx_frames: int, tx_frames: int) -> bool:
-        errors = Happened.BUS_ERROR in seen.happened and rx_frames == self._rx_frames
+        passive = seen.state is BusState.ERROR_PASSIVE
+        received = rx_frames != self._rx_frames
         self._rx_frames = rx_frames
-        if not errors:
+        # More than any buffer holds: so the older ones have left it.
+        if received or tx_frames - self._tx_left > LARGEST_BUFFER or (self._since_s is None and not passive):
+            self._tx_left, self._tx_seen = self._tx_seen, tx_frames
             self._since_s = None
-            self._passive = False
-            self._tx_frames = tx_frames
-            return False
+            if not passive:
+                return False
         if self._since_s is None:
             self._since_s = now_s
-        self._passive |= seen.state is BusState.ERROR_PASSIVE
-        return self._passive and tx_frames > self._tx_frames and now_s - self._since_s >= self.limit_s
+            self._looks = 0
+        self._looks += 1
+        lasts = self._looks >= STALL_LOOKS and now_s - self._since_s >= self.limit_s
+        return lasts and tx_frames > self._tx_left
 
 
 def _notice(happened: Happened) -> bytes | None:

@@ -230,3 +230,8 @@ class Told:
         self.quiet = True
         for cause in self._causes.values():
             cause.again = True
+
+
+def repeated(times: int) -> str:
+    """For a log line: what Told.tell() returned."""
+    return f" ({times} times since this was told last)" if times > 1 else ""

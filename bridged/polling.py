@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bridged.adapters.base import Reply
 from bridged.errors import AdapterError
 from bridged.health import UNKNOWN, BusState, Happened, Health, Observation, Stall
+from bridged.lifecycle import Told, repeated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -64,9 +66,11 @@ class HealthPolling:
         self._steps: HealthSteps | None = None
         self._unknown = 0  # looks one after the other without an answer
         self.description = ""  # what the adapter said last
+        self.full_at = -math.inf  # when it said last that its transmit buffer was full
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
         self._logged: dict[str, float] = {}  # what was in the log, and when
+        self._told = Told()
 
     def start(self, now: float, *, restarted: bool = False) -> None:
         """The adapter runs; `restarted`: after bus-off."""
@@ -171,8 +175,8 @@ class HealthPolling:
         now = time.monotonic()
         self._sample(now, counters["rx_frames"], counters["tx_frames"])
         if self._stall.observe(seen, now, counters["decoded"], counters["tx_frames"]):
-            text = f"{seen.description} for {self._stall.limit_s:g} s, and nothing is received"
-            self._bus_off(f"{text}: it may be bus-off, or no other node acknowledges its frames")
+            text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
+            self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
             return
         overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
@@ -188,15 +192,27 @@ class HealthPolling:
 
     def _take(self, seen: Observation) -> None:
         self.description = seen.description
+        if seen.happened & Happened.TX_FULL:
+            self.full_at = time.monotonic()
         before = self.health.state
         for frame in self.health.observe(seen, time.monotonic()):
             self._tell(frame)
         state = self.health.state
         if state is not None and state != before and (before is not None or state != BusState.ERROR_ACTIVE):
-            level = logging.INFO if state == BusState.ERROR_ACTIVE else logging.WARNING
-            log.log(level, "bus_state=%s: %s", state.text, seen.description)
+            self._log_state(state, seen.description)
             if state is BusState.BUS_OFF:
                 self._bus_off(seen.description)
+
+    def _log_state(self, state: BusState, description: str) -> None:
+        """A bus that is never well for long is not told each time."""
+        if state is BusState.ERROR_ACTIVE:
+            level = logging.DEBUG if self._told.quiet else logging.INFO
+            log.log(level, "bus_state=%s: %s", state.text, description)
+            self._told.well()
+            return
+        times = self._told.tell(state.text, time.monotonic())
+        if times is not None:
+            log.warning("bus_state=%s: %s%s", state.text, description, repeated(times))
 
     def _warn(self, pattern: str, text: str) -> None:
         """Each text once in LOG_INTERVAL_S."""

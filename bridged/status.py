@@ -109,7 +109,7 @@ class StatusServer:
 def _admit_group(path: Path) -> None:
     """For the owner and the service's group, if there is one, or the owner's."""
     if os.geteuid() == 0:
-        with contextlib.suppress(KeyError):  # no such group: not installed as a service
+        with contextlib.suppress(KeyError, OSError):  # no such group: not installed as a service; a container
             os.chown(path, -1, grp.getgrnam(GROUP).gr_gid)
     path.chmod(0o660)
 

@@ -84,6 +84,7 @@ class Adapter(Protocol):
     identity: Identity
     polling: Polling | None  # known after init_steps, as is
     flow: Flow | None  # None: the device answers each frame
+    discarded: int  # frames that it took and threw away, as far as it tells
     last_words: bytes  # close the channel, where no time is left to await answers
 
     def init_steps(self, serial_number: str | None) -> Steps:

@@ -45,6 +45,7 @@ STATUS_FLAGS = {
 STATES = {2: BusState.ERROR_WARNING, 5: BusState.ERROR_PASSIVE}
 HAPPENED = {
     0: Happened.RX_OVERFLOW,
+    1: Happened.TX_FULL,
     3: Happened.RX_OVERFLOW,
     6: Happened.ARBITRATION_LOST,
     7: Happened.BUS_ERROR,
@@ -56,6 +57,7 @@ class Can232:
 
     codec = "can232"
     flow: Flow | None = None
+    discarded = 0  # it does not tell
     last_words = b"C\rC\r"
 
     def __init__(self, adapter: Can232Config, channel: ChannelConfig, memory: Memory) -> None:

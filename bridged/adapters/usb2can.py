@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -99,6 +98,7 @@ class Usb2can:
         self._noise = bytearray()
         self._levels_prefix: bytes | None = None  # how this firmware begins its answer to COMMAND GET
         self._health: dict[int, Exchange] = {}  # what is asked to know how the bus is
+        self.discarded = 0
         self._restarts: bytes | None = None  # as READ_RST tells them: in which byte order is not said
         self._mode_exchange = _exchange(
             message(GET_MODE), "tell its mode", bytes((GET_MODE, 1)), optional=True
@@ -150,7 +150,7 @@ class Usb2can:
 
     def _drain(self) -> Steps:
         """Waits while frames leave its transmit buffer; a pause is a question whose answer is not awaited."""
-        fewest, looks = math.inf, DRAIN_LOOKS
+        fewest, looks = 255, DRAIN_LOOKS
         for _ in range(DRAIN_LOOKS_MAX):
             levels = yield from self._read_levels()
             if levels is None or not levels.waiting:
@@ -160,7 +160,7 @@ class Usb2can:
             if not looks:
                 break
             yield Exchange(message(GET_MODE), "wait", (NONE,), (), timeout_s=DRAIN_INTERVAL_S)
-        log.warning("%d frames did not leave the adapter: they are thrown away with its buffer", fewest)
+        self.discarded += fewest
 
     def _in_config_mode(self, request: bytes) -> Exchange:
         """A request that nothing acknowledges, and GET_MODE, whose answer comes when it is done."""

@@ -31,6 +31,9 @@ _BAUDRATE_TOLERANCE: Final = 0.03  # an 8N1 receiver bears about 5 % between bot
 _TCGETS2: Final = 0x802C542A  # asm-generic/ioctls.h: the speed in bit/s, where termios knows named rates only
 _TERMIOS2: Final = struct.Struct("=IIIIB19sII")  # ..., c_ispeed, c_ospeed (asm-generic/termbits.h)
 
+_INT: Final = struct.Struct("=i")
+_LINGER: Final = struct.Struct("=ii")
+
 _CONNECT_LIMIT_S: Final = 5.0
 # A peer that vanishes without a word is noticed after 10 s: silence and 3 probes, or data unacknowledged.
 _TCP_OPTIONS: Final = (
@@ -124,9 +127,16 @@ class TcpPort:
         self.fd = self._socket.fileno()
 
     def close(self) -> None:
+        """What the other side has not taken yet is not sent any more."""
+        if self.fd < 0:
+            return
         self.fd = -1
         with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
+            (unsent,) = _INT.unpack(fcntl.ioctl(self._socket, termios.TIOCOUTQ, _INT.pack(0)))
+            if unsent:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.pack(1, 0))
+            else:
+                self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import re
 import socket
 import struct
@@ -74,7 +75,15 @@ class Watch:
         """Whether there is something to open. True where one cannot know."""
         if self._usb:
             return self._has_usb_device()
-        return "://" in self._port or Path(self.path()).exists()
+        if "://" in self._port:
+            return True
+        try:
+            os.stat(self.path())  # noqa: PTH116 - exists() does not tell why not
+        except PermissionError:  # opening says so
+            return True
+        except OSError:
+            return False
+        return True
 
     def path(self) -> str:
         """What to open: the port, or the tty that has the serial number if what the port means has not."""

@@ -82,9 +82,10 @@ bool flow_ask_due(const struct relay *r, bool more, int64_t now)
     return f->sent_count ? !more : now >= flow_deadline(r);
 }
 
-void flow_asked(struct relay *r)
+void flow_asked(struct relay *r, int64_t now)
 {
     r->flow.asking = true;
+    r->flow.asked_ns = now;
     r->flow.asked = r->flow.sent_count;
 }
 
@@ -108,15 +109,16 @@ static void ask_again_at(struct flow *f, int64_t now)
     f->ask_delay_ns *= f->ask_delay_ns < ASK_LAST_NS ? 2 : 1;
 }
 
-/* The device says how many frames are in its buffer, `taken` more than at the last time. */
-static void level_observe(struct relay *r, uint32_t level, uint32_t taken, int64_t now)
+/* The device says how many frames are in its buffer, `taken` more than at the last time. The answer may have
+ * waited for us, so it counts as from when the question was put. */
+static void level_observe(struct relay *r, uint32_t level, uint32_t taken)
 {
     struct flow *f = &r->flow;
     bool left = !f->level || level < f->level + taken;
     f->level = level;
     if (left)
-        f->left_at_ns = now;
-    if (!level || now - f->left_at_ns <= stuck_ns(r))
+        f->left_at_ns = f->asked_ns;
+    if (!level || f->asked_ns - f->left_at_ns <= stuck_ns(r))
         return;
     f->left_at_ns = NEVER; /* said once */
     relay_emit(r, EVENT_STUCK, level, NULL, 0);
@@ -151,7 +153,7 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
     if (f->stopped)
         f->stopped = !(level >= 0 && level < (int)f->ready) && now - f->stopped_ns < STOP_LIMIT_NS;
     if (level >= 0) {
-        level_observe(r, (uint32_t)level, taken_count, now);
+        level_observe(r, (uint32_t)level, taken_count);
         f->room = room_above(f, (uint32_t)level);
     } else {
         f->room = f->critical < f->capacity ? room_above(f, f->critical) : !f->sent_count;

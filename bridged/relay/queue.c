@@ -61,6 +61,17 @@ void queue_expire(struct relay *r, int64_t now)
     }
 }
 
+/* When the first of those that wait is too old. */
+int64_t queue_expires_ns(struct relay *r)
+{
+    int64_t born = NEVER;
+    if (r->queue_count)
+        born = waiting_at(r, 0)->born_ns;
+    if (r->retry_count && retry_at(r, 0)->born_ns < born)
+        born = retry_at(r, 0)->born_ns;
+    return born == NEVER ? NEVER : born + r->set.deadline_ns + 1;
+}
+
 /* A frame from the bus: into the queue, or dropped for what the gate says. */
 void queue_add(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now)
 {

@@ -2,11 +2,12 @@
 #include "relay.h"
 
 #include <errno.h>
-#include <poll.h>
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/eventfd.h>
+#include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -14,6 +15,12 @@
 #define RX_RETRY_NS INT64_C(1000000)
 #define DOUBT_QUIET_NS INT64_C(50000000)     /* until a frame counts that nothing has followed yet */
 #define PARTIAL_QUIET_NS INT64_C(1000000000) /* until the beginning of a message counts as noise */
+
+#ifndef SYS_epoll_pwait2
+#define SYS_epoll_pwait2 441 /* in Linux 5.11; unknown to older headers */
+#endif
+
+enum source { WAKE = 1, PORT = 2, BUS = 4 };
 
 /* Counts on while the machine is suspended, so that frames grow old in their sleep too. */
 int64_t relay_clock(void)
@@ -42,18 +49,34 @@ static void message_headers_init(struct relay *r)
     }
 }
 
+/* Unlike ppoll it is told once what to wait for, not at each turn. -> 0 or errno */
+static int watch(struct relay *r, int operation, int fd, enum source source, uint32_t events)
+{
+    struct epoll_event wanted = {.events = events, .data.u32 = source};
+    return epoll_ctl(r->epoll_fd, operation, fd, &wanted) < 0 ? errno : 0;
+}
+
+/* It may be closed already, and is then not watched any more. */
+static void unwatch(struct relay *r, int fd)
+{
+    if (fd >= 0)
+        epoll_ctl(r->epoll_fd, EPOLL_CTL_DEL, fd, NULL);
+}
+
 struct relay *relay_new(const struct settings *set)
 {
     struct relay *r = calloc(1, sizeof *r);
     if (!r)
         return NULL;
     r->set = *set;
-    r->port = r->bus = r->wake_fd = r->event_fd = -1;
+    r->port = r->bus = r->wake_fd = r->event_fd = r->epoll_fd = -1;
     r->rx_stalled_ns = r->rx_retry_ns = r->quiet_at_ns = NEVER;
     r->queue = calloc(set->queue, sizeof *r->queue);
     r->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     r->event_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-    if (!r->queue || r->wake_fd < 0 || r->event_fd < 0) {
+    r->epoll_fd = epoll_create1(EPOLL_CLOEXEC);
+    if (!r->queue || r->wake_fd < 0 || r->event_fd < 0 || r->epoll_fd < 0
+        || watch(r, EPOLL_CTL_ADD, r->wake_fd, WAKE, EPOLLIN)) {
         int error = errno;
         relay_free(r);
         errno = error;
@@ -71,6 +94,8 @@ void relay_free(struct relay *r)
         close(r->wake_fd);
     if (r->event_fd >= 0)
         close(r->event_fd);
+    if (r->epoll_fd >= 0)
+        close(r->epoll_fd);
     free(r->queue);
     free(r);
 }
@@ -118,6 +143,7 @@ static void bus_lost(struct relay *r, int error)
 {
     if (r->bus < 0)
         return;
+    unwatch(r, r->bus);
     r->bus = -1;
     relay_emit(r, EVENT_BUS_LOST, (uint32_t)error, NULL, 0);
 }
@@ -142,13 +168,21 @@ static void rx_failed(struct relay *r, int error, int64_t now)
     rx_drop(r, r->rx_count, RX_BUS_LOST);
 }
 
+/* A single frame, as they come on most buses, is cheaper without the vector. -> frames sent, or -1 with errno */
+static int rx_send(struct relay *r)
+{
+    if (r->rx_count > 1)
+        return sendmmsg(r->bus, r->rx_msg, r->rx_count, MSG_DONTWAIT | MSG_NOSIGNAL);
+    return send(r->bus, &r->rx[0], sizeof r->rx[0], MSG_DONTWAIT | MSG_NOSIGNAL) < 0 ? -1 : 1;
+}
+
 /* Puts the decoded frames on the bus. */
 static void rx_flush(struct relay *r, int64_t now)
 {
     if (r->bus < 0)
         rx_drop(r, r->rx_count, RX_BUS_LOST);
     while (r->rx_count) {
-        int n = sendmmsg(r->bus, r->rx_msg, r->rx_count, MSG_DONTWAIT | MSG_NOSIGNAL);
+        int n = rx_send(r);
         if (n < 0 && errno == EINTR)
             continue;
         if (n < 0) {
@@ -320,12 +354,17 @@ void relay_attach_port(struct relay *r, int fd)
 {
     relay_detach_port(r);
     r->port = fd;
+    r->port_full = false;
+    int error = watch(r, EPOLL_CTL_ADD, fd, PORT, EPOLLIN);
+    if (error)
+        relay_port_lost(r, error);
 }
 
 /* The descriptor stays its owner's to close. What it said in part is noise. */
 void relay_detach_port(struct relay *r)
 {
     r->attachments++;
+    unwatch(r, r->port);
     r->port = -1;
     r->receiving = false;
     if (r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY)
@@ -344,71 +383,81 @@ void relay_detach_port(struct relay *r)
 void relay_attach_bus(struct relay *r, int fd)
 {
     r->attachments++;
+    unwatch(r, r->bus);
     r->bus = fd;
+    int error = fd >= 0 ? watch(r, EPOLL_CTL_ADD, fd, BUS, EPOLLIN) : 0;
+    if (error)
+        bus_lost(r, error);
 }
 
 /* --- the loop -------------------------------------------------------------------------------- */
 
-static int64_t next_deadline(const struct relay *r)
+static int64_t next_deadline(struct relay *r)
 {
-    int64_t at = transmit_deadline(r);
+    int64_t at = transmit_idle(r) ? NEVER : transmit_deadline(r);
     at = r->quiet_at_ns < at ? r->quiet_at_ns : at;
     return r->rx_retry_ns < at ? r->rx_retry_ns : at;
 }
 
-/* Waits without the lock until something is there or `until` has come. Never fails for long: EINTR
- * cannot happen with all signals blocked, EINVAL and ENOMEM would be bugs that show as a busy loop. */
-static bool wait_ready(struct relay *r, struct pollfd fds[3], int64_t now, int64_t until)
+/* Waits for room in the port as long as there is something for it. */
+static void watch_room(struct relay *r)
+{
+    bool full = r->out_start < r->out_end;
+    if (r->port < 0 || full == r->port_full)
+        return;
+    r->port_full = full;
+    watch(r, EPOLL_CTL_MOD, r->port, PORT, full ? EPOLLIN | EPOLLOUT : EPOLLIN);
+}
+
+/* Waits without the lock until something is there or `until` has come; says which sources are ready.
+ * Never fails for long: EINTR cannot happen with all signals blocked, EINVAL would be a bug that shows as a
+ * busy loop. */
+static unsigned int wait_ready(struct relay *r, int64_t now, int64_t until)
 {
     struct timespec t = {0}, *timeout = until == NEVER ? NULL : &t;
+    struct epoll_event ready[3];
     if (until > now && timeout) {
         t.tv_sec = (until - now) / NS_PER_S;
         t.tv_nsec = (until - now) % NS_PER_S;
     }
-    fds[0] = (struct pollfd){.fd = r->wake_fd, .events = POLLIN};
-    fds[1] = (struct pollfd){.fd = r->port, .events = POLLIN};
-    fds[2] = (struct pollfd){.fd = r->bus, .events = POLLIN};
-    if (r->out_start < r->out_end)
-        fds[1].events |= POLLOUT;
+    watch_room(r);
     uint32_t attachments = r->attachments;
     pthread_mutex_unlock(&r->lock);
-    int n = ppoll(fds, 3, timeout, NULL);
+    long n = syscall(SYS_epoll_pwait2, r->epoll_fd, ready, 3, timeout, NULL, (size_t)0);
     pthread_mutex_lock(&r->lock);
     r->count.turns++;
-    if (fds[0].revents) {
+    unsigned int sources = 0;
+    for (long i = 0; i < n; i++)
+        if (ready[i].events & ~(uint32_t)EPOLLOUT)
+            sources |= ready[i].data.u32;
+    if (sources & WAKE) {
         uint64_t value;
         ssize_t ignored = read(r->wake_fd, &value, sizeof value);
         (void)ignored;
     }
-    return n > 0 && attachments == r->attachments;
+    return attachments == r->attachments ? sources : 0;
 }
 
 /* What has come is handled, what may go is sent. `now` is the time of this turn. */
-static void handle_ready(struct relay *r, const struct pollfd fds[3], int64_t now)
+static int64_t turn(struct relay *r, unsigned int ready, int64_t now)
 {
-    if (fds[1].revents & ~POLLOUT && r->port >= 0)
+    if (ready & PORT && r->port >= 0)
         port_read(r, now);
-    if (fds[2].revents && r->bus >= 0)
+    if (ready & BUS && r->bus >= 0)
         bus_read(r, now);
-}
-
-static int64_t turn(struct relay *r, const struct pollfd *ready, int64_t now)
-{
-    if (ready)
-        handle_ready(r, ready, now);
     if (r->rx_retry_ns <= now)
         rx_flush(r, now);
     if (r->quiet_at_ns <= now)
         quiet_over(r, now);
-    transmit_pump(r, now);
+    if (!transmit_idle(r))
+        transmit_pump(r, now);
     return next_deadline(r);
 }
 
 /* One turn without waiting, at a time of the caller's choice: tests run the relay on their own clock. */
 int64_t relay_turn(struct relay *r, int64_t now)
 {
-    struct pollfd fds[3];
-    return turn(r, wait_ready(r, fds, now, now) ? fds : NULL, now);
+    return turn(r, wait_ready(r, now, now), now);
 }
 
 /* Turns until relay_stop. Returns at once with EBUSY if another thread runs it. */
@@ -422,12 +471,11 @@ int relay_run(struct relay *r)
     if (!result) {
         r->running = true;
         int64_t now = relay_clock();
-        int64_t until = turn(r, NULL, now);
+        int64_t until = turn(r, 0, now);
         while (!r->stop) {
-            struct pollfd fds[3];
-            bool ready = wait_ready(r, fds, now, until);
+            unsigned int ready = wait_ready(r, now, until);
             now = relay_clock();
-            until = turn(r, ready ? fds : NULL, now);
+            until = turn(r, ready, now);
         }
         r->running = r->stop = false;
     }

@@ -1,7 +1,7 @@
 /* The relay: moves frames between a port (bytes) and a bus (struct can_frame), with full accounting.
  *
  * One thread runs relay_run(). Everything in struct relay is guarded by `lock`, which that thread
- * holds all the time except while it waits in ppoll(). So any other thread that takes the lock sees
+ * holds all the time except while it waits. So any other thread that takes the lock sees
  * the relay between two turns: the counters of a snapshot add up.
  *
  *   frames read from the bus = confirmed + dropped (by reason) + queued
@@ -164,6 +164,7 @@ struct flow {
     struct tx_frame sent[WINDOW_MAX]; /* ring: not known to be taken yet */
     uint32_t sent_head, sent_count;
     uint32_t asked;        /* how many of them the question in flight covers */
+    int64_t asked_ns;      /* when it was put */
     uint32_t room;         /* frames that fit surely */
     uint32_t level;        /* frames in the device's buffer when it said so last; 0: not known */
     int64_t left_at_ns;    /* when one was seen to have left it last */
@@ -182,8 +183,10 @@ struct relay {
     bool stop, running;
     int wake_fd;  /* eventfd: another thread changed something */
     int event_fd; /* eventfd: events to fetch */
+    int epoll_fd; /* waits for wake_fd, port and bus */
     int port, bus;
-    uint32_t attachments; /* counts attach and detach: results of a ppoll before one are void */
+    bool port_full; /* epoll_fd waits for room in the port, too */
+    uint32_t attachments; /* counts attach and detach: results of a wait before one are void */
     enum gate gate;
     bool receiving;
 
@@ -259,6 +262,7 @@ void relay_port_lost(struct relay *r, int error);
 void queue_add(struct relay *r, const struct can_frame *frame, int64_t born_ns, int64_t now);
 void queue_drop(struct relay *r, enum tx_drop reason);
 void queue_expire(struct relay *r, int64_t now);
+int64_t queue_expires_ns(struct relay *r);
 void queue_set_gate(struct relay *r, enum gate gate);
 int queue_resize(struct relay *r, uint32_t size); /* -> 0 or ENOMEM */
 bool queue_waiting(const struct relay *r);
@@ -272,8 +276,9 @@ struct tx_frame retry_pop(struct relay *r);
 /* transmit.c: all with the lock held */
 void transmit_reset(struct relay *r);
 bool transmit_command(struct relay *r, const struct command *command);
+bool transmit_idle(const struct relay *r);
 void transmit_pump(struct relay *r, int64_t now);
-int64_t transmit_deadline(const struct relay *r);
+int64_t transmit_deadline(struct relay *r);
 uint32_t transmit_queued(const struct relay *r);
 void transmit_answer(struct relay *r, const struct codec_message *msg, const struct can_frame *frame, int64_t now);
 
@@ -283,7 +288,7 @@ void flow_start(struct relay *r, const struct flow *set);
 void flow_reset(struct relay *r);
 bool flow_ready(const struct relay *r);
 bool flow_ask_due(const struct relay *r, bool more, int64_t now);
-void flow_asked(struct relay *r);
+void flow_asked(struct relay *r, int64_t now);
 void flow_sent(struct relay *r, const struct tx_frame *tx);
 void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now);
 void flow_unanswered(struct relay *r);

@@ -355,7 +355,7 @@ static bool send_next(struct relay *r, int64_t now)
         return false;
     }
     if (flow_ask_due(r, frame_ready(r, now) && !r->command_count, now)) {
-        flow_asked(r);
+        flow_asked(r, now);
         send_command(r, &r->flow.ask, INFLIGHT_LEVEL, now);
         return true;
     }
@@ -400,11 +400,20 @@ static void out_flush(struct relay *r)
     r->out_until_ns = NEVER;
 }
 
+/* Nothing waits, nothing is in flight: transmit_pump and transmit_deadline have nothing to look at. */
+bool transmit_idle(const struct relay *r)
+{
+    bool owed = r->queue_count || r->retry_count || r->command_count || r->inflight_count || r->out_end;
+    return !owed && !r->poll.length && !r->flow.ask.length && !r->doubtful && !r->checking && !r->resyncing;
+}
+
 /* Sends what the window allows, in one write. */
 void transmit_pump(struct relay *r, int64_t now)
 {
-    if (r->port < 0)
+    if (r->port < 0) {
+        queue_expire(r, now);
         return;
+    }
     if (now >= r->out_until_ns) { /* the port takes nothing: what waits here must not go out late */
         relay_port_lost(r, ETIME);
         return;
@@ -421,11 +430,11 @@ void transmit_pump(struct relay *r, int64_t now)
 }
 
 /* When transmit_pump has something to do without any input. */
-int64_t transmit_deadline(const struct relay *r)
+int64_t transmit_deadline(struct relay *r)
 {
     int64_t at = NEVER;
     if (r->port < 0)
-        return at;
+        return queue_expires_ns(r);
     if (r->inflight_count) {
         uint32_t i = r->resyncing ? r->inflight_count - 1 : 0;
         at = r->inflight[(r->inflight_head + i) % INFLIGHT_MAX].deadline_ns;

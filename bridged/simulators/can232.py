@@ -66,7 +66,8 @@ class Can232:
     `version` as `V` answers it; older than V1220 has no X, W, Z, Q. `processing_s` is what a command takes.
     A `uart` with one of the manual's rates counts as set up by `U` before. Faults are the attributes
     `silent` (nothing is sent, commands are carried out), `refusals` (so many frames from the host are
-    answered BELL), `drop_answers` (so many answers are lost), bits set in `flags`, and the methods below.
+    answered BELL), `refuses_all` (every command is), `drop_answers` (so many answers are lost), bits set in
+    `flags`, and the methods below.
     ValueError if the version is none.
     """
 
@@ -88,6 +89,7 @@ class Can232:
         self.counters = Counters()
         self.silent = False
         self.refusals = 0
+        self.refuses_all = False
         self.drop_answers = 0
         self.bus_off = False
         if self.uart.baud in UART_RATES:
@@ -152,6 +154,12 @@ class Can232:
         if bus_off != self.bus_off:
             self.bus_off = bus_off
             self._start_sending(self._clock)
+
+    def set_listen_only(self, now: float, listen_only: bool) -> None:
+        """An open channel is in listen-only mode, which its host did not want, until it is opened again."""
+        self.advance(now)
+        if self.state in _IS_OPEN:
+            self.state = State.LISTEN_ONLY if listen_only else State.OPEN
 
     def set_error_counters(self, now: float, tec: int, rec: int) -> None:
         """Errors on the bus: the flags tell of each limit that is crossed, either way (EI, EPI)."""
@@ -291,6 +299,7 @@ class Can232:
         rule = _RULES.get(line[0])
         if (
             rule is not None
+            and not self.refuses_all
             and self.state in rule.states
             and self._software >= rule.since
             and rule.pattern.fullmatch(line)

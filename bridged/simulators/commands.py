@@ -18,7 +18,8 @@ from bridged.errors import BridgeError, PortError
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.ends import open_can
-from bridged.simulators.serve import FAULTS, USB2CAN_FAULTS, Simulator, parse_fault
+from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, parse_fault
+from bridged.simulators.serve import Simulator
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser, adapter: str) -> None:
     """The options of `can-bridge simulate ADAPTER`, one of ADAPTERS."""
     parser.set_defaults(adapter=adapter)
     if adapter == "can232":
-        _add_common(parser, FAULTS)
+        _add_common(parser, CAN232_FAULTS)
         _add_can232(parser)
     else:
         _add_common(parser, USB2CAN_FAULTS)

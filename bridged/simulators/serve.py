@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import functools
@@ -11,14 +10,15 @@ import itertools
 import json
 import math
 import random
-import re
 import select
 import socket
-import sys
 import time
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from collections import deque
+from typing import TYPE_CHECKING, Any, Protocol
 
+from bridged.simulators import faults
 from bridged.simulators.ends import BusEnd, HeldUp, HostEnd, LineEnd, PtyEnd
+from bridged.simulators.faults import BURST_S, Fault
 from bridged.simulators.sja1000 import Frame
 
 if TYPE_CHECKING:
@@ -29,37 +29,16 @@ if TYPE_CHECKING:
 
     from bridged.simulators.can232_memory import Eeprom
     from bridged.simulators.uart import Uart
-    from bridged.simulators.usb2can import Usb2can
+
+__all__ = ["Device", "Fault", "Simulator", "mixed_frames", "record_line"]
 
 UART_QUEUE = 4096  # characters a host's UART takes for a paced line before its write waits
 SPIN_S = 0.001  # --precise: no sleeping so close to a deadline,
 ACTIVE_S = 0.005  # nor so soon after something happened
-BURST_S = 0.01  # between two bursts of a fault that lasts
-VALUE_2_BURST = 20  # messages
 BATCH_S = 0.001  # made-up frames wait so long for each other; a host's USB does no better
 TRAFFIC_BATCH = 32  # at most, a device has buffers for twice as many
 TRAFFIC_LATE_S = 0.05  # a bus does not catch up; it has been silent
 RECONNECT_S = 0.1
-
-BUS_FAULTS = ("warning", "passive", "busoff")
-FAULTS = ("silence", "garbage", *BUS_FAULTS, "refuse", "drop", "reset", "poweroff", "unplug")
-USB2CAN_FAULTS = (*FAULTS, "lostgo", "value2", "overrun")
-
-
-class Fault(NamedTuple):
-    """One of the device's, `start_s` after the start; without a duration once, or for good."""
-
-    kind: str
-    start_s: float
-    duration_s: float = 0.0
-
-
-def parse_fault(text: str, kinds: Sequence[str] = FAULTS) -> Fault:
-    """`KIND@START[+DURATION]` in seconds, as `silence@5+3`; ArgumentTypeError if it is not."""
-    match = re.fullmatch(r"([a-z]+[0-9]?)@(\d+\.?\d*)(?:\+(\d+\.?\d*))?", text)
-    if not match or match[1] not in kinds:
-        raise argparse.ArgumentTypeError(f"{text!r} is not KIND@START[+DURATION], KIND {', '.join(kinds)}")
-    return Fault(match[1], float(match[2]), float(match[3] or 0))
 
 
 def mixed_frames(rng: random.Random) -> Iterator[Frame]:
@@ -109,6 +88,7 @@ class Device(Protocol):
     def power_off(self, now: float) -> None: ...
     def power_cycle(self, now: float) -> None: ...
     def set_bus_off(self, now: float, bus_off: bool) -> None: ...
+    def set_listen_only(self, now: float, listen_only: bool) -> None: ...
     def set_error_counters(self, now: float, tec: int, rec: int) -> None: ...
     def garbage(self, now: float, noise: bytes) -> None: ...
     def host_writes(self, now: float, data: bytes) -> None: ...
@@ -159,6 +139,7 @@ class Simulator:
         self._on_frame = on_frame
         self._record = record
         self._faults = faults
+        self._asked_for: deque[Fault] = deque()
         self._precise = precise
         self._eeprom_file = eeprom_file
         self._eeprom_writes = -1  # in the file
@@ -197,7 +178,7 @@ class Simulator:
         self._started = now = self._clock()
         self._next_traffic = self._traffic_wake = now + self._traffic_s
         for fault in self._faults:
-            self._schedule(now + fault.start_s, functools.partial(self._begin, fault))
+            self._plan(fault, now)
         try:
             self._make_link()
             if self._uart and self._uart.baud:
@@ -215,6 +196,11 @@ class Simulator:
     def stop(self) -> None:
         """End `run()`; from any thread, or a signal handler."""
         self._stopping = True
+        self._awake()
+
+    def begin(self, fault: Fault) -> None:
+        """Have it happen `start_s` from now; from any thread."""
+        self._asked_for.append(fault)
         self._awake()
 
     def request_state(self) -> None:
@@ -264,6 +250,8 @@ class Simulator:
             for age_s, frame in bus.read():
                 device.bus_frame(self._clock() - age_s, frame)
         now = self._clock()
+        while self._asked_for:
+            self._plan(self._asked_for.popleft(), now)
         while self._agenda and self._agenda[0][0] <= now:
             heapq.heappop(self._agenda)[2](now)
         if self._traffic_wake <= now:
@@ -376,82 +364,29 @@ class Simulator:
     def _schedule(self, at: float, action: Callable[[float], None]) -> None:
         heapq.heappush(self._agenda, (at, next(self._order), action))
 
+    def _plan(self, fault: Fault, now: float) -> None:
+        self._schedule(now + fault.start_s, functools.partial(self._begin, fault))
+
     def _begin(self, fault: Fault, now: float) -> None:
-        device = self.device
-        match fault.kind:
-            case "silence":
-                device.silent = True
-            case "garbage":
-                self._repeat(self._make_noise, now + fault.duration_s, now)
-            case "warning":
-                device.set_error_counters(now, 100, 3)
-            case "passive":
-                device.set_error_counters(now, 130, 3)
-            case "busoff":
-                device.set_bus_off(now, True)
-            case "refuse":
-                device.refusals = sys.maxsize if fault.duration_s else 1
-            case "drop":
-                device.drop_answers = sys.maxsize if fault.duration_s else 1
-            case "reset":
-                device.power_cycle(now)
-            case "poweroff":
-                device.power_off(now)
-            case "unplug":
-                device.power_off(now)
-                self._unplug()
-            case _:
-                self._begin_usb2can(fault, now)
+        faults.begin(self.device, fault, now)
+        if fault.kind == "unplug":
+            self._unplug()
+        repeated = faults.repeated(self.device, fault, self._noise)
+        if repeated:
+            self._repeat(repeated, now + fault.duration_s, now)
         if fault.duration_s:
             self._schedule(now + fault.duration_s, functools.partial(self._end, fault))
 
     def _end(self, fault: Fault, now: float) -> None:
-        device = self.device
-        match fault.kind:
-            case "silence":
-                device.silent = False
-            case "warning" | "passive":
-                device.set_error_counters(now, 0, 0)
-            case "busoff":
-                device.set_bus_off(now, False)
-            case "refuse":
-                device.refusals = 0
-            case "drop":
-                device.drop_answers = 0
-            case "poweroff":
-                device.power_on(now)
-            case "unplug":
-                device.power_on(now)
-                self._plug_in()
-            case "lostgo":
-                self._usb2can().lose_go = 0
-
-    def _usb2can(self) -> Usb2can:
-        """The device, whose fault only it has."""
-        from bridged.simulators.usb2can import Usb2can  # noqa: PLC0415 - only the adapter in use is loaded
-
-        assert isinstance(self.device, Usb2can)
-        return self.device
-
-    def _begin_usb2can(self, fault: Fault, now: float) -> None:
-        device = self._usb2can()
-        until = now + fault.duration_s
-        match fault.kind:
-            case "lostgo":
-                device.lose_go = sys.maxsize if fault.duration_s else 1
-            case "value2":
-                self._repeat(functools.partial(device.value_2_burst, count=VALUE_2_BURST), until, now)
-            case "overrun":
-                self._repeat(device.overrun, until, now)
+        faults.end(self.device, fault, now)
+        if fault.kind == "unplug":
+            self._plug_in()
 
     def _repeat(self, action: Callable[[float], None], until: float, now: float) -> None:
         """Once, and again every BURST_S until then."""
         action(now)
         if now + BURST_S < until:
             self._schedule(now + BURST_S, functools.partial(self._repeat, action, until))
-
-    def _make_noise(self, now: float) -> None:
-        self.device.garbage(now, self._noise.randbytes(self._noise.randint(1, 16)))
 
     # The host
 

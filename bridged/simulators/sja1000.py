@@ -166,6 +166,12 @@ class Sja1000:
         """Where arbitration was last lost, and what the last bus error was."""
         self._registers[ALC], self._registers[ECC] = alc, ecc
 
+    def force_listen_only(self, listen_only: bool) -> None:
+        """Into listen-only mode or out of it, which no write can do outside of reset mode: a fault."""
+        mode = self._registers[MOD] & ~MOD_LISTEN_ONLY
+        self._registers[MOD] = mode | MOD_LISTEN_ONLY * listen_only
+        self._look()
+
     def set_bus_off(self, bus_off: bool) -> None:
         """Into bus-off (6.4.11, 6.4.12: RXERR 0, TXERR 127), or recovered from it."""
         self.bus_off = bus_off

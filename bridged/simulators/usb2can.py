@@ -60,8 +60,8 @@ class Usb2can(Firmware):
     Faults are the attributes `silent` (nothing is sent, commands are carried out), `refusals` (so many frames
     from the host are handed back), `drop_answers` (so many answers are lost), `lose_go` (so many GO are), and
     the methods below. `violations` says in words what the host did against the manual. What it sends after a
-    power failure before its next CONFIG_MODE counts for nothing: it cannot know. ValueError if the version is
-    none.
+    power failure, or in a mode that it did not choose, before its next CONFIG_MODE counts for nothing: it
+    cannot know. ValueError if the version is none.
     """
 
     def __init__(
@@ -153,6 +153,14 @@ class Usb2can(Firmware):
         """Bus-off: no frames either way as long as it lasts."""
         self.advance(now)
         self.bus_off = bus_off
+        self._update()
+        self._reckon()
+
+    def set_listen_only(self, now: float, listen_only: bool) -> None:
+        """The controller is in listen-only mode, which its host did not want, until it is set up anew."""
+        self.advance(now)
+        self._unaware = self._unaware or listen_only
+        self.chip.force_listen_only(listen_only)
         self._update()
         self._reckon()
 

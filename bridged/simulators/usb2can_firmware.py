@@ -124,7 +124,7 @@ class Firmware:
         self._fifo: deque[Frame] = deque()  # from the host, to the bus
         self._head_done = math.inf  # when the first of these is on the bus
         self._clock = self._power_on = now
-        self._unaware = False  # the host does not know of a power failure
+        self._unaware = False  # the host does not know of a power failure, or in which mode this is
 
     @property
     def waiting(self) -> int:
@@ -412,7 +412,7 @@ class Firmware:
             return
         if self.chip.in_reset:
             self._violate("WRITE_MESSAGE: the chip is in reset mode (III.10)")
-        elif self.chip.listen_only:
+        elif self.chip.listen_only and not self._unaware:
             self._violate("WRITE_MESSAGE: the chip is in listen-only mode")
         fifo = self._fifo
         if self.refusals or len(fifo) >= self._capacity:

@@ -65,6 +65,7 @@ class Rig:
         self._relay_next: int | None = None
         self.damage = (b"", 0)  # the message that begins so loses this byte
         self.corrupt = False  # what the device says next loses a byte
+        self._stop_lost = False  # it may have been "stop"
         self.sent: list[Frame] = []  # by the device, on its bus
         self.received: list[bytes] = []  # from the relay, on the host's bus
         self.events: list[tuple[int, int, bytes]] = []
@@ -138,6 +139,7 @@ class Rig:
                 output, self.damage = output[:at] + output[at + 1 :], (b"", 0)
             if self.corrupt:
                 self.corrupt = False
+                self._stop_lost = True
                 output = output[:1] + output[2:]
             self._up.append((self.now + LATENCY_NS, output))
         self.sent += self.device.take_bus_frames()
@@ -176,7 +178,9 @@ class Rig:
     def close(self) -> None:
         for s in (self.port, self._near_port, self.bus, self._near_bus):
             s.close()
-        assert self.device.violations == []
+        assert not [
+            text for text in self.device.violations if not (self._stop_lost and "after a STOP" in text)
+        ]
 
 
 @contextlib.contextmanager

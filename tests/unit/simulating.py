@@ -13,7 +13,8 @@ from pathlib import Path
 
 import bridged
 from bridged.simulators.can232 import Can232
-from bridged.simulators.serve import USB2CAN_FAULTS, Device, Simulator, parse_fault
+from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, parse_fault
+from bridged.simulators.serve import Device, Simulator
 
 TIMEOUT_S = 20
 
@@ -84,7 +85,7 @@ def by_hand(device: Device | None = None, *faults: str, **options: object) -> tu
     clock = HandClock()
     clock.simulator = Simulator(
         device or Can232(),
-        faults=[parse_fault(text, USB2CAN_FAULTS) for text in faults],
+        faults=[parse_fault(text, CAN232_FAULTS + USB2CAN_FAULTS) for text in faults],
         clock=clock,
         **options,  # type: ignore[arg-type]
     )

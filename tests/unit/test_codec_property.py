@@ -65,7 +65,7 @@ PIECES = st.one_of(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.lists(PIECES, max_size=20), st.data())
 def test_however_a_stream_is_cut_the_same_comes_out(pieces: list[bytes], data: st.DataObject) -> None:
     stream = b"".join(pieces)

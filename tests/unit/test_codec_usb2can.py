@@ -117,7 +117,7 @@ def test_the_identifier_is_left_aligned(frame: bytes) -> None:
         assert int.from_bytes(message[4:6]) == (can_id & 0x7FF) << 5
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.lists(st.one_of(MESSAGES, byte_strings(0, 12)), max_size=20), st.data())
 def test_however_a_stream_is_cut_the_same_comes_out(pieces: list[bytes], data: st.DataObject) -> None:
     stream = b"".join(pieces)
@@ -228,7 +228,7 @@ def comes_out(stream: Damaged, places: list[int]) -> bool:
     return all(told(decode(stream.messages[stream.intact[at]]))[0][0] in found for at in places)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(MESSAGES, min_size=3, max_size=20), st.lists(DAMAGES, min_size=1, max_size=4))
 def test_damage_costs_what_it_touches_and_the_message_after(
     messages: list[bytes], damages: list[Damage]

@@ -86,36 +86,54 @@ def test_an_adapter_that_is_away_has_no_state() -> None:
     health.observe(counted(100, 0), 0.0)
     health.forget()
     assert (health.state, health.tec, health.rec) == (None, None, None)
-    assert len(health.observe(counted(100, 0), 1.0)) == 1
+    assert health.observe(counted(100, 0), 1.0) == []  # the bus knows
+    health.forget()
+    assert len(health.observe(counted(0, 0), 2.0)) == 1
 
 
-ERRORS = Observation("", ACTIVE, lasting=False, happened=Happened.BUS_ERROR)
-ERRORS_PASSIVE = Observation("", PASSIVE, lasting=False, happened=Happened.BUS_ERROR)
-NO_ERRORS = Observation("", ACTIVE, lasting=False)
+PASSIVE_SEEN = Observation("", PASSIVE, lasting=False)
+NOTHING_SEEN = Observation("", ACTIVE, lasting=False)
+Look = tuple[Observation, int, int]  # frames received, taken
 
 
-def test_frames_that_do_not_leave_the_adapter() -> None:
-    """As where nobody acknowledges: passive is said once, bus errors each time."""
-    stall = Stall(1.0)
-    assert not stall.observe(NO_ERRORS, 0.0, 5, 7)
-    assert not stall.observe(ERRORS_PASSIVE, 0.25, 5, 8)
-    assert not stall.observe(ERRORS, 1.2, 5, 8)
-    assert stall.observe(ERRORS, 1.25, 5, 8)
+def stalls(*looks: Look) -> bool:
+    """One each quarter of a second, the first at the start."""
+    stall = Stall(0.5, 5, 7)
+    return any(
+        stall.observe(seen, 0.25 * at, rx_frames, tx_frames)
+        for at, (seen, rx_frames, tx_frames) in enumerate(looks)
+    )
+
+
+@pytest.mark.parametrize(
+    "looks",
+    [
+        [(NOTHING_SEEN, 5, 7), (PASSIVE_SEEN, 5, 8), *[(PASSIVE_SEEN, 5, 8)] * 2],
+        [(PASSIVE_SEEN, 5, 8), *[(NOTHING_SEEN, 5, 8)] * 2],  # the flag is that of an interrupt
+        [(NOTHING_SEEN, 5, 8), (PASSIVE_SEEN, 5, 8), *[(NOTHING_SEEN, 5, 8)] * 2],  # taken just before a look
+        [(NOTHING_SEEN, 5, 7), (PASSIVE_SEEN, 9, 8), *[(NOTHING_SEEN, 9, 8)] * 2],  # received before
+        [(PASSIVE_SEEN, 5, 7), *[(NOTHING_SEEN, 5, 7)] * 9, (NOTHING_SEEN, 5, 8)],  # taken long after
+    ],
+)
+def test_frames_that_may_not_leave_the_adapter(looks: list[Look]) -> None:
+    assert stalls(*looks)
+    assert not stalls(*looks[:-1])
 
 
 @pytest.mark.parametrize(
     ("looks", "why"),
     [
-        ([(ERRORS_PASSIVE, 5, 7), (ERRORS, 5, 7)], "it took no frame"),
-        ([(ERRORS_PASSIVE, 5, 8), (ERRORS, 6, 8)], "frames are received"),
-        ([(ERRORS_PASSIVE, 5, 8), (NO_ERRORS, 5, 8), (ERRORS, 5, 8)], "there was a look without errors"),
-        ([(ERRORS, 5, 8), (ERRORS, 5, 8)], "a noisy bus on which frames get through"),
+        ([(PASSIVE_SEEN, 5, 7), *[(NOTHING_SEEN, 5, 7)] * 9], "it took no frame"),
+        ([(PASSIVE_SEEN, 5, 8), (NOTHING_SEEN, 6, 8), *[(NOTHING_SEEN, 6, 8)] * 9], "frames are received"),
+        ([(NOTHING_SEEN, 5, 8)] * 9, "it never was error-passive"),
+        (
+            [(NOTHING_SEEN, 5, 7), (PASSIVE_SEEN, 5, 8), (NOTHING_SEEN, 5, 90), *[(NOTHING_SEEN, 5, 90)] * 9],
+            "it took more than it has room for",
+        ),
     ],
 )
-def test_frames_that_may_well_leave_the_adapter(looks: list[tuple[Observation, int, int]], why: str) -> None:
-    stall = Stall(1.0, 5, 7)
-    for at, (seen, rx_frames, tx_frames) in enumerate(looks):
-        assert not stall.observe(seen, 2.0 * at, rx_frames, tx_frames), why
+def test_frames_that_do_leave_the_adapter(looks: list[Look], why: str) -> None:
+    assert not stalls(*looks), why
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255)), max_size=30))

@@ -426,7 +426,7 @@ def test_idle_relay_has_no_deadline(rig: Rig) -> None:
     assert rig.turn() is None
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(
     seed=st.integers(0, 2**32),
     window=st.integers(1, 4),

@@ -322,7 +322,7 @@ FAULTS = st.sampled_from(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(st.tuples(FAULTS, st.integers(0, 30), st.integers(0, 40)), max_size=12),
     st.sampled_from([{}, {"answers_get": False}, {"tx_buffer": 3}]),

@@ -380,13 +380,13 @@ registers = st.binary(min_size=4, max_size=4)
 masks = registers | st.lists(st.sampled_from([0xFF, 0xF0, 0x0F, 0xFE, 0]), min_size=4, max_size=4).map(bytes)
 
 
-@settings(deadline=None)
+
 @given(code=registers, mask=masks, single=st.booleans(), frame=frames())
 def test_filter_agrees_with_the_data_sheet(code: bytes, mask: bytes, single: bool, frame: Frame):
     assert accepts(code, mask, single, frame) == accepts_bit_by_bit(code, mask, single, frame)
 
 
-@settings(deadline=None)
+
 @given(single=st.booleans(), second=st.booleans(), frame=frames())
 @example(single=True, second=False, frame=Frame(0x123, False, False, 1, b"\x55"))
 def test_each_bit_of_the_code_counts_as_the_data_sheet_says(single: bool, second: bool, frame: Frame):
@@ -486,7 +486,7 @@ def test_garbage_comes_between_messages():
     assert device.take_output(0) == noise + b"t10021133\r"
 
 
-@settings(deadline=None)
+
 @given(data=st.binary(max_size=200), cuts=st.lists(st.integers(0, 200), max_size=5))
 def test_however_the_bytes_are_cut_the_device_does_the_same(data: bytes, cuts: list[int]):
     whole, pieces = opened(), opened()

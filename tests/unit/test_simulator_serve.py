@@ -19,7 +19,8 @@ from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.commands import load_eeprom
 from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
-from bridged.simulators.serve import Fault, Simulator, mixed_frames, parse_fault
+from bridged.simulators.faults import Fault, parse_fault
+from bridged.simulators.serve import Simulator, mixed_frames
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.uart import Uart
 

@@ -74,7 +74,7 @@ pieces = st.lists(
 ).map(b"".join)  # fmt: skip
 
 
-@settings(deadline=None)
+
 @given(data=pieces, cuts=st.lists(st.integers(0, 300)), processing_s=st.sampled_from([0.0, 0.0001]))
 def test_the_device_does_the_same_however_the_bytes_are_cut(
     data: bytes, cuts: list[int], processing_s: float
@@ -290,7 +290,7 @@ actions = st.lists(
 )
 
 
-@settings(deadline=None)
+
 @given(actions=actions, version=st.sampled_from(["HW0003FW0016", "HW0003FW3001", "HW0003FW5001"]))
 def test_whatever_happens_no_frame_is_unaccounted_for(actions: list[tuple[str, object]], version: str):
     device = Usb2can(version=version)

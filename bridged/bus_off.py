@@ -1,0 +1,105 @@
+"""What is done when an adapter is bus-off, seems to be, or takes no frames: `channel.restart`."""
+
+from __future__ import annotations
+
+import logging
+import random
+import time
+from typing import TYPE_CHECKING
+
+from bridged.lifecycle import Backoff, Event, Told, repeated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bridged.adapters.base import Adapter
+    from bridged.config import Config
+    from bridged.polling import HealthPolling
+
+log = logging.getLogger(__name__)
+
+STUCK_LEAST_S = 0.5  # as STUCK_LEAST_NS in queue.c
+REFUSING_S, REFUSING_LONGEST_S = 60.0, 3600.0
+
+ANEW = (
+    "; the channel is closed and opened anew, which throws away what is in the adapter's buffer, "
+    "so that nothing is sent late"
+)
+
+
+def stuck_s(config: Config) -> float:
+    """For how long no frame may leave the adapter: what is in its buffer is older than the deadline then."""
+    return max(config.transmit.deadline_s, STUCK_LEAST_S)
+
+
+class BusOff:
+    """Decides for a running adapter; `dispatch` tells the lifecycle.
+
+    What waits in the adapter's own buffer would be sent whenever the bus lets it, however old: so the channel
+    is closed in any case.
+    """
+
+    def __init__(self, config: Config, adapter: Adapter, dispatch: Callable[[Event, str], None]) -> None:
+        self.config = config
+        self._adapter = adapter
+        self._dispatch = dispatch
+        self._pause_s: float | None = None
+        self._restarting = False
+        # An adapter that refuses every frame though its buffer is not full: a new start may help, but it may
+        # also be that it does not know such frames.
+        self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, random.random)
+        self._refusing_until = 0.0
+        self._discarded = 0  # of the adapter's, those told
+        self._told = Told()
+
+    def take_pause_s(self) -> float | None:
+        """How long the next pause is to be, once; None: the back-off decides."""
+        pause_s, self._pause_s = self._pause_s, None
+        return pause_s
+
+    def take_restarting(self) -> bool:
+        """Whether it runs again after bus-off; once."""
+        restarting, self._restarting = self._restarting, False
+        return restarting
+
+    def off(self, cause: str) -> None:
+        """It is bus-off, or cannot tell whether it is."""
+        restart_s = self.config.channel.restart_s
+        if restart_s == 0.0:  # it restarts itself
+            return
+        if restart_s is None:
+            bus = self.config.bus
+            interface = f"ip link set {bus.channel} down, then up" if bus.interface == "socketcan" else ""
+            advice = f"{interface or 'a new start of the bridge'}, puts it on the bus again"
+            self._dispatch(Event.BUS_OFF, f"{cause}; channel.restart is never: {advice}")
+            return
+        self._restarting = True
+        self._begin_anew(restart_s, f"{cause}{ANEW}")
+
+    def stuck(self, frames: int, polling: HealthPolling) -> None:
+        """It has taken no frame for stuck_s(), or none has left it; in its buffer are so many, if it tells."""
+        now = time.monotonic()
+        limit_s = stuck_s(self.config)
+        pause_s = self.config.reconnect.initial_s
+        cause = f"no frame has left the adapter for {limit_s:g} s"
+        if self._adapter.flow is not None:
+            why = "does another node acknowledge them? Is the bus always busy?"
+            self._begin_anew(pause_s, f"{cause}, {frames} are in its buffer ({why}){ANEW}")
+        elif now - polling.full_at <= limit_s:  # it cannot tell bus-off
+            self.off(f"{cause} (does another node acknowledge them?), its status: {polling.description}")
+        elif now >= self._refusing_until:
+            self._refusing_until = now + self._refusing.next_s(now)
+            reason = f"the adapter refuses every frame, its status: {polling.description}"
+            self._begin_anew(pause_s, f"{reason} (is it in listen-only mode?); it is initialised anew")
+
+    def closed(self) -> None:
+        """Tells of frames that were in the adapter's buffer."""
+        frames, self._discarded = self._adapter.discarded - self._discarded, self._adapter.discarded
+        times = self._told.tell("discarded", time.monotonic()) if frames else None
+        if times is not None:
+            text = "frames did not leave the adapter before its channel was closed: they are thrown away"
+            log.warning("%d %s%s", frames, text, repeated(times))
+
+    def _begin_anew(self, pause_s: float, reason: str) -> None:
+        self._pause_s = pause_s
+        self._dispatch(Event.SILENT, reason)
