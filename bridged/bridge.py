@@ -87,6 +87,7 @@ class Bridge:
         self._identity: object = None  # that was told
         self._bus_off = BusOff(config, self.adapter, self._dispatch)
         self._unanswered_log_at = 0.0
+        self._unanswered_told = Told()
         self._turns: object = None  # of the relay, when they were looked at last
         sync = self.adapter.sync
         self._relay = _relay.Relay(
@@ -463,8 +464,12 @@ class Bridge:
 
     def _on_unanswered(self, resyncs: int) -> None:
         now = time.monotonic()
-        if now >= self._unanswered_log_at:
-            self._unanswered_log_at = now + UNANSWERED_LOG_S
+        if now < self._unanswered_log_at:
+            return
+        self._unanswered_log_at = now + UNANSWERED_LOG_S
+        times = self._unanswered_told.tell("unanswered", now)
+        self._unanswered_told.well()
+        if times is not None:
             log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", resyncs)
 
     def _on_stuck(self, frames: int) -> None:

@@ -69,15 +69,18 @@ class BusOff:
             return
         if restart_s is None:
             bus = self.config.bus
-            interface = f"ip link set {bus.channel} down, then up" if bus.interface == "socketcan" else ""
-            advice = f"{interface or 'a new start of the bridge'}, puts it on the bus again"
-            self._dispatch(Event.BUS_OFF, f"{cause}; channel.restart is never: {advice}")
+            how = "a new start of the bridge"
+            if bus.interface == "socketcan":
+                how = f"ip link set {bus.channel} down, then up,"
+            self._dispatch(
+                Event.BUS_OFF, f"{cause}; channel.restart is never: {how} puts it on the bus again"
+            )
             return
         self._restarting = True
         self._begin_anew(restart_s, f"{cause}{ANEW}")
 
     def stuck(self, frames: int, polling: HealthPolling) -> None:
-        """It has taken no frame for stuck_s(), or none has left it; in its buffer are so many, if it tells."""
+        """It has taken none for stuck_s(), or none has left it; so many are in its buffer, if it tells."""
         now = time.monotonic()
         limit_s = stuck_s(self.config)
         pause_s = self.config.reconnect.initial_s

@@ -6,7 +6,7 @@ import math
 import random
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bridged.simulators.can232 import RECEIVE_FIFO, TRANSMIT_FIFO, Can232, State
@@ -380,11 +380,9 @@ registers = st.binary(min_size=4, max_size=4)
 masks = registers | st.lists(st.sampled_from([0xFF, 0xF0, 0x0F, 0xFE, 0]), min_size=4, max_size=4).map(bytes)
 
 
-
 @given(code=registers, mask=masks, single=st.booleans(), frame=frames())
 def test_filter_agrees_with_the_data_sheet(code: bytes, mask: bytes, single: bool, frame: Frame):
     assert accepts(code, mask, single, frame) == accepts_bit_by_bit(code, mask, single, frame)
-
 
 
 @given(single=st.booleans(), second=st.booleans(), frame=frames())
@@ -484,7 +482,6 @@ def test_garbage_comes_between_messages():
     device.garbage(0, noise)
     device.bus_frame(0, FRAME)
     assert device.take_output(0) == noise + b"t10021133\r"
-
 
 
 @given(data=st.binary(max_size=200), cuts=st.lists(st.integers(0, 200), max_size=5))

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from usb2can_words import (
     BOOT,
@@ -72,7 +72,6 @@ pieces = st.lists(
     | st.binary(max_size=8),
     max_size=12,
 ).map(b"".join)  # fmt: skip
-
 
 
 @given(data=pieces, cuts=st.lists(st.integers(0, 300)), processing_s=st.sampled_from([0.0, 0.0001]))
@@ -288,7 +287,6 @@ actions = st.lists(
     ),
     max_size=25,
 )
-
 
 
 @given(actions=actions, version=st.sampled_from(["HW0003FW0016", "HW0003FW3001", "HW0003FW5001"]))
