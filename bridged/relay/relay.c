@@ -2,6 +2,7 @@
 #include "relay.h"
 
 #include <errno.h>
+#include <limits.h>
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
@@ -21,6 +22,7 @@
 #endif
 
 enum source { WAKE = 1, PORT = 2, BUS = 4 };
+enum { SOURCES = 3 };
 
 /* Counts on while the machine is suspended, so that frames grow old in their sleep too. */
 int64_t relay_clock(void)
@@ -409,21 +411,29 @@ static void watch_room(struct relay *r)
     watch(r, EPOLL_CTL_MOD, r->port, PORT, full ? EPOLLIN | EPOLLOUT : EPOLLIN);
 }
 
-/* Waits without the lock until something is there or `until` has come; says which sources are ready.
- * Never fails for long: EINTR cannot happen with all signals blocked, EINVAL would be a bug that shows as a
- * busy loop. */
+/* For `ns` at most, or NEVER. -> how many sources are ready, or -1. Never fails for long: EINTR cannot happen
+ * with all signals blocked, EINVAL would be a bug that shows as a busy loop. */
+static long wait_epoll(int epoll_fd, struct epoll_event ready[SOURCES], int64_t ns)
+{
+    const struct {
+        int64_t s, ns; /* struct __kernel_timespec: on a 32-bit machine too */
+    } timeout = {ns / NS_PER_S, ns % NS_PER_S};
+    long n = syscall(SYS_epoll_pwait2, epoll_fd, ready, SOURCES, ns == NEVER ? NULL : &timeout, NULL, (size_t)0);
+    if (n >= 0 || (errno != ENOSYS && errno != EPERM)) /* an older kernel; a filter that does not know the call */
+        return n;
+    int64_t ms = ns / 1000000 + (ns % 1000000 != 0);
+    return epoll_wait(epoll_fd, ready, SOURCES, ns == NEVER ? -1 : ms > INT_MAX ? INT_MAX : (int)ms);
+}
+
+/* Waits without the lock until something is there or `until` has come; says which sources are ready. */
 static unsigned int wait_ready(struct relay *r, int64_t now, int64_t until)
 {
-    struct timespec t = {0}, *timeout = until == NEVER ? NULL : &t;
-    struct epoll_event ready[3];
-    if (until > now && timeout) {
-        t.tv_sec = (until - now) / NS_PER_S;
-        t.tv_nsec = (until - now) % NS_PER_S;
-    }
+    struct epoll_event ready[SOURCES];
+    int64_t wait_ns = until == NEVER ? NEVER : until > now ? until - now : 0;
     watch_room(r);
     uint32_t attachments = r->attachments;
     pthread_mutex_unlock(&r->lock);
-    long n = syscall(SYS_epoll_pwait2, r->epoll_fd, ready, 3, timeout, NULL, (size_t)0);
+    long n = wait_epoll(r->epoll_fd, ready, wait_ns);
     pthread_mutex_lock(&r->lock);
     r->count.turns++;
     unsigned int sources = 0;
