@@ -14,6 +14,8 @@
 #
 # Each boot starts from the pristine image. Status 97: the guest died; 124: time is up; otherwise the command's own.
 # Set CAN_BRIDGE_VM_ACCEL=kvm where KVM works: it is much faster, but /dev/kvm being there proves nothing.
+# CAN_BRIDGE_VM_ACCEL=icount is a machine with one processor that takes exactly 1 ns for each instruction, and no
+# time at all to wait: what is measured in it depends neither on this machine nor on what else runs here.
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -71,12 +73,13 @@ python=$top/.venv/bin/python
 hostside=$!
 
 case ${CAN_BRIDGE_VM_ACCEL:-tcg} in
-    tcg) set -- -accel tcg,thread=multi,tb-size=512 -cpu max,la57=off ;;
-    *) set -- -accel "$CAN_BRIDGE_VM_ACCEL" -cpu host ;;
+    tcg) set -- -accel tcg,thread=multi,tb-size=512 -cpu max,la57=off -smp 2 ;;
+    icount) set -- -accel tcg,thread=single,tb-size=512 -icount shift=0,sleep=off -cpu max,la57=off -smp 1 ;;
+    *) set -- -accel "$CAN_BRIDGE_VM_ACCEL" -cpu host -smp 2 ;;
 esac
 status=0
 # From within its directory: the path of a socket may have 107 characters only.
-(cd "$ctl" && exec timeout --foreground "$limit" qemu-system-x86_64 "$@" -smp 2 -m 2048 \
+(cd "$ctl" && exec timeout --foreground "$limit" qemu-system-x86_64 "$@" -m 2048 \
     -nodefaults -no-user-config -display none -no-reboot \
     -machine q35,usb=off,vmport=off,smbus=off,sata=off,i8042=off,hpet=off,graphics=off \
     -kernel "$image/vmlinux" -initrd "$image/initrd.img" \
