@@ -5,7 +5,7 @@ of USB/IP (Documentation/usb/usbip_protocol.rst) on one end of a socketpair, who
 Everything that a host sends is in `received`; what `send` was given goes to the host.
 """
 
-import contextlib
+import math
 import os
 import select
 import shutil
@@ -50,11 +50,18 @@ def string_descriptor(text: str) -> bytes:
 
 
 class FakeFt245:
-    def __init__(self, serial_number: str) -> None:
+    """The chip; `idle_s` is how long at least it says nothing while it has nothing to say.
+
+    What is wired to it overrides `_work_at`, `_work` and `_arrived`, which are called in its thread.
+    """
+
+    def __init__(self, serial_number: str, idle_s: float = MIN_LATENCY_S) -> None:
         self.serial_number = serial_number
+        self._idle_s = idle_s
         self.requests: list[tuple[int, int, int, int]] = []  # FTDI's: type, request, value, index
         self.idle_packets = 0  # that carried no data
         self.latency_ms = 16
+        self.heard_all_at = 0.0  # time.time(); what `_arrived` is given has come since, however busy we were
         self._received = bytearray()
         self._to_send = bytearray()
         self._reads: list[tuple[int, int, float]] = []  # sequence number, length, when it is answered at last
@@ -83,13 +90,20 @@ class FakeFt245:
     def send(self, data: bytes) -> None:
         with self._lock:
             self._to_send += data
-        os.write(self._wake[1], b"x")
+        self._awake()
+
+    def _awake(self) -> None:
+        if self._port >= 0:
+            os.write(self._wake[1], b"x")
 
     def plug(self) -> None:
+        self._reads.clear()
+        self._to_send.clear()
+        self.heard_all_at = time.time()
         ours, theirs = socket.socketpair()
+        self._wake = os.pipe()
         rows = (line.split() for line in (VHCI / "status").read_text().splitlines())
         self._port = next(int(row[1]) for row in rows if row[0] == "hs" and row[2] == FREE)
-        self._wake = os.pipe()
         with theirs:
             (VHCI / "attach").write_text(f"{self._port} {theirs.fileno()} {self._port + 2} {SPEED_FULL}")
         self._thread = threading.Thread(target=self._serve, args=(ours,), daemon=True)
@@ -105,56 +119,83 @@ class FakeFt245:
         for fd in self._wake:
             os.close(fd)
 
+    def _work_at(self) -> float:
+        """When `_work` has something to do (time.monotonic()); math.inf if that is not known."""
+        return math.inf
+
+    def _work(self) -> None:
+        """What is due behind the chip; called in every turn."""
+
+    def _arrived(self, data: bytes) -> None:
+        """The host has sent this."""
+        with self._lock:
+            self._received += data
+
     def _serve(self, line: socket.socket) -> None:
-        self._reads.clear()
-        with line, contextlib.suppress(EOFError, OSError):  # unplugged
-            while True:
-                wait_s = max(0.0, self._reads[0][2] - time.monotonic()) if self._reads else None
-                ready, _, _ = select.select([line.fileno(), self._wake[0]], [], [], wait_s)
-                if self._wake[0] in ready:
-                    os.read(self._wake[0], 4096)
-                if line.fileno() in ready:
-                    self._take(line)
-                while self._reads and (self._to_send or self._reads[0][2] <= time.monotonic()):
-                    sequence, length, _ = self._reads.pop(0)
-                    self._reply(line, sequence, self._packets(length))
-                    later = self._idle_until()
-                    self._reads = [(other, size, later) for other, size, _ in self._reads]
+        ends = [line.fileno(), self._wake[0]]
+        while True:
+            now = time.time()
+            ready, _, _ = select.select(ends, [], [], 0)
+            if not ready:
+                self.heard_all_at = now
+                until = min(self._work_at(), self._reads[0][2] if self._reads else math.inf)
+                wait_s = None if until == math.inf else max(0.0, until - time.monotonic())
+                ready, _, _ = select.select(ends, [], [], wait_s)
+            if self._wake[0] in ready:
+                os.read(self._wake[0], 4096)
+            if line.fileno() in ready and not self._take(line):
+                break
+            self._work()
+            if not self._answer_reads(line):
+                break
+        line.close()
+
+    def _answer_reads(self, line: socket.socket) -> bool:
+        """Data, or none after a while; False: unplugged."""
+        while self._reads and (self._to_send or self._reads[0][2] <= time.monotonic()):
+            sequence, length, _ = self._reads.pop(0)
+            if not self._reply(line, sequence, self._packets(length)):
+                return False
+            later = self._idle_until()
+            self._reads = [(other, size, later) for other, size, _ in self._reads]
+        return True
 
     def _idle_until(self) -> float:
-        return time.monotonic() + max(self.latency_ms / 1000, MIN_LATENCY_S)
+        return time.monotonic() + max(self.latency_ms / 1000, self._idle_s)
 
-    def _take(self, line: socket.socket) -> None:
-        fields = SUBMIT.unpack(receive(line, SUBMIT.size))
-        command, sequence, _, direction, endpoint, flags, length, *_, setup = fields
+    def _take(self, line: socket.socket) -> bool:
+        """One request of the kernel's; False: unplugged."""
+        header = receive(line, SUBMIT.size)
+        if header is None:
+            return False
+        command, sequence, _, direction, endpoint, flags, length, *_, setup = SUBMIT.unpack(header)
         if command == CMD_UNLINK:  # in its place of the flags is which one
             waiting = len(self._reads)
             self._reads = [read for read in self._reads if read[0] != flags]
             status = UNLINKED if len(self._reads) < waiting else 0
-            line.sendall(RESULT.pack(RET_UNLINK, sequence, 0, 0, 0, status, 0, 0, 0, 0))
-            return
+            return send(line, RESULT.pack(RET_UNLINK, sequence, 0, 0, 0, status, 0, 0, 0, 0))
         data = receive(line, length) if direction != DIRECTION_IN else b""
+        if data is None:
+            return False
         if endpoint == 0:
             answer = self._control(setup)
             if answer is None:
-                self._reply(line, sequence, status=STALL)
-            elif direction == DIRECTION_IN:
-                self._reply(line, sequence, answer)
-            else:
-                self._reply(line, sequence, length=length)
-        elif direction == DIRECTION_IN:
+                return self._reply(line, sequence, status=STALL)
+            if direction == DIRECTION_IN:
+                return self._reply(line, sequence, answer)
+            return self._reply(line, sequence, length=length)
+        if direction == DIRECTION_IN:
             self._reads.append((sequence, length, self._idle_until()))
-        else:
-            with self._lock:
-                self._received += data
-            self._reply(line, sequence, length=length)
+            return True
+        self._arrived(data)
+        return self._reply(line, sequence, length=length)
 
     @staticmethod
     def _reply(
         line: socket.socket, sequence: int, data: bytes = b"", *, status: int = 0, length: int | None = None
-    ) -> None:
+    ) -> bool:
         size = len(data) if length is None else length
-        line.sendall(RESULT.pack(RET_SUBMIT, sequence, 0, 0, 0, status, size, 0, 0, 0) + data)
+        return send(line, RESULT.pack(RET_SUBMIT, sequence, 0, 0, 0, status, size, 0, 0, 0) + data)
 
     def _packets(self, length: int) -> bytes:
         """At most `length` bytes: packets of two status bytes and up to 62 of data, until one is not full."""
@@ -190,11 +231,24 @@ class FakeFt245:
         )
 
 
-def receive(line: socket.socket, n: int) -> bytes:
+def send(line: socket.socket, data: bytes) -> bool:
+    """False: the kernel has closed its end, the chip is unplugged."""
+    try:
+        line.sendall(data)
+    except OSError:
+        return False
+    return True
+
+
+def receive(line: socket.socket, n: int) -> bytes | None:
+    """So many bytes; None: the chip is unplugged."""
     data = b""
     while len(data) < n:
-        block = line.recv(n - len(data))
+        try:
+            block = line.recv(n - len(data))
+        except OSError:
+            return None
         if not block:
-            raise EOFError
+            return None
         data += block
     return data

@@ -5,6 +5,7 @@ Frames are strings as candump logs them and cansend takes them: ``123#1122``, ``
 """
 
 import contextlib
+import ctypes
 import json
 import os
 import random
@@ -17,16 +18,19 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import pytest
 import yaml
+
+from bridged.status import StatusError, query
 
 # An emulated machine is some twenty times slower than a real one: deadlines are for what will never come.
 DEADLINE_S = 60.0
 SOCKET_BUFFER = 10_000_000
 HOST = Path("/ctl/host")  # shared with the host of the virtual machine, see vm/hostside.py
 MONITOR = Path("/dev/virtio-ports/qmp")
+PR_SET_THP_DISABLE = 41  # linux/prctl.h
 
 T = TypeVar("T")
 
@@ -73,6 +77,12 @@ def assert_same_frames(received: Sequence[str], expected: Sequence[str]) -> None
         f"{len(received)} frames received, {len(expected)} expected, different from number {at} on: "
         f"received … {' '.join(received[near])} … expected … {' '.join(expected[near])} …"
     )
+
+
+class Resources(NamedTuple):
+    threads: int
+    descriptors: int
+    resident_kib: int
 
 
 class Process:
@@ -148,10 +158,15 @@ class Candump(Process):
         return self._out.read_bytes().count(b"\n")
 
     @property
+    def stamped(self) -> list[tuple[float, str]]:
+        """The frames there are so far, each with its time in seconds."""
+        lines = self.out.rpartition("\n")[0].splitlines()
+        rows = [line.split() for line in lines if line.startswith("(")]  # a loss is told in between
+        return [(float(stamp[1:-1]), frame) for stamp, _, frame in rows]
+
+    @property
     def frames(self) -> list[str]:
-        """The frames there are so far."""
-        complete = self.out.rpartition("\n")[0]
-        return [line.split()[2] for line in complete.splitlines()]
+        return [frame for _, frame in self.stamped]
 
     def finish(self, count: int, *, deadline_s: float = DEADLINE_S, quiet_s: float = 0.5) -> list[str]:
         """All frames, once ``count`` have come and no more have followed for ``quiet_s``."""
@@ -189,6 +204,23 @@ class Bridge(Process):
         )
         return dict(json.loads(asked.stdout)) if asked.stdout else {}
 
+    def snapshot(self) -> dict[str, Any]:
+        """The same, straight from its socket: it takes no program that must start first."""
+        try:
+            return query(self._socket)
+        except StatusError:
+            return {}
+
+    def resources(self) -> Resources:
+        """What the process holds at this moment; see `no_huge_pages`."""
+        process = Path("/proc", str(self.pid))
+        pages = int((process / "statm").read_text().split()[1])
+        return Resources(
+            threads=len(list((process / "task").iterdir())),
+            descriptors=len(list((process / "fd").iterdir())),
+            resident_kib=pages * os.sysconf("SC_PAGE_SIZE") // 1024,
+        )
+
     def wait_status(
         self, condition: Callable[[dict[str, Any]], bool], what: str, deadline_s: float = DEADLINE_S
     ) -> dict[str, Any]:
@@ -197,7 +229,7 @@ class Bridge(Process):
 
         def fulfilled() -> dict[str, Any]:
             nonlocal last
-            last = self.read_status()
+            last = self.snapshot()
             return last if last and condition(last) else {}
 
         try:
@@ -340,6 +372,11 @@ def ask_monitor(command: str, **arguments: Any) -> Any:
                         return reply["return"]
     finally:
         os.close(monitor)
+
+
+def no_huge_pages() -> None:
+    """For programs started from now on: the kernel fills them up when it likes, which looks like a leak."""
+    assert ctypes.CDLL(None).prctl(PR_SET_THP_DISABLE, 1, 0, 0, 0) == 0
 
 
 class Rig:

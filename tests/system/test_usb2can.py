@@ -4,22 +4,17 @@ Behind the chip `ftdi0` the adapter is simulated on the host, so that it keeps u
 behind other chips it is simulated in the guest, with its CAN side on a second vcan.
 """
 
-import contextlib
+import itertools
 import json
-import os
 import random
-import re
-import socket
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import ftdi_vhci
 import pytest
 from rig import HOST, Bridge, Candump, Process, Rig, assert_same_frames, mixed_frames, receivers, wait_until
 from test_can232 import PATIENT, balanced
+from wired import in_order, plugged, wait_terminal
 
 from bridged.simulators import serve
 
@@ -28,22 +23,8 @@ pytestmark = pytest.mark.timeout(600)
 BOTH_PORTS = pytest.mark.parametrize("raw", [True, False], ids=["libusb", "tty"])
 FRAMES = 20_000
 FULL_BUS = 8000  # frames a second of 1 Mbit/s
-STEADY, BURST = "1ABCDEF0", "1ABCDEF1"  # identifiers that none of the traffic has
-BURST_LENGTH = 1000  # takes a second at 125 kbit/s
-DEADLINE = 1.0  # seconds; of frames where the chip is unplugged
 SEED = 7
 FAKE = "PY000011"  # serial number
-
-
-def find_terminal(serial_number: str) -> Path | None:
-    """The link that udev has made; None while another than the kernel's driver has the chip."""
-    return next(Path("/dev/serial/by-id").glob(f"*{serial_number}*"), None)
-
-
-def wait_terminal(serial_number: str) -> Path:
-    link = wait_until(lambda: find_terminal(serial_number), f"the terminal of {serial_number}")
-    assert link
-    return link
 
 
 def address(serial_number: str, *, raw: bool) -> str:
@@ -64,23 +45,6 @@ def traffic(count: int, seed: int = SEED) -> list[str]:
     """What a simulated bus carries with --traffic, --count and --seed."""
     frames = serve.mixed_frames(random.Random(seed))
     return [serve.record_line(next(frames)).strip() for _ in range(count)]
-
-
-def in_order(some: Iterable[str], of: Iterable[str]) -> bool:
-    """Whether they are all among these, in their order."""
-    rest = iter(of)
-    return all(frame in rest for frame in some)
-
-
-def newest(dump: Candump) -> float:
-    """The time in seconds of the last frame there is so far."""
-    return float(dump.out.rpartition("\n")[0].rpartition("(")[2].partition(")")[0])
-
-
-def stamped(dump: Candump) -> list[tuple[float, str]]:
-    """The frames there are so far, each with its time in seconds."""
-    rows = [line.split() for line in dump.out.rpartition("\n")[0].splitlines()]
-    return [(float(stamp[1:-1]), frame) for stamp, _, frame in rows]
 
 
 class Adapter:
@@ -196,7 +160,7 @@ def test_each_way_at_1_mbit(rig: Rig, raw: bool) -> None:
     seen = adapter.wait_traffic()
     wait_received(bridge, dump, seen)
     assert_received(bridge, dump.finish(0), seen, traffic(FRAMES))
-    log = stamped(dump)
+    log = dump.stamped
     tell_rate("device to bus", len(log), log[-1][0] - log[0][0])
 
     there = mixed_frames(FRAMES, seed=1)
@@ -269,134 +233,24 @@ def test_two_chips_are_told_apart(rig: Rig) -> None:
         adapter.stop_closed()
 
 
-class WiredFt245(ftdi_vhci.FakeFt245):
-    """A fake chip whose FIFO ends in the terminal of a simulated adapter."""
-
-    def __init__(self, serial_number: str, terminal: Path) -> None:
-        super().__init__(serial_number)
-        self._terminal = os.open(terminal, os.O_RDWR | os.O_NOCTTY)
-        threading.Thread(target=self._wire, daemon=True).start()
-
-    def _wire(self) -> None:
-        with contextlib.suppress(OSError):  # the simulator has ended
-            while data := os.read(self._terminal, 4096):
-                self.send(data)
-
-    def _take(self, line: socket.socket) -> None:
-        super()._take(line)
-        with self._lock:
-            data = bytes(self._received)
-            self._received.clear()
-        while data:
-            data = data[os.write(self._terminal, data) :]
-
-
-@pytest.fixture
-def plug() -> Iterator[Callable[[Path], WiredFt245]]:
-    """Plugs in a fake chip with this terminal behind it; its serial number is FAKE. One at a time."""
-    if not ftdi_vhci.load_driver():
-        pytest.skip("this kernel has no vhci-hcd, or does not let us use it")
-    chips = []
-
-    def plug(terminal: Path) -> WiredFt245:
-        chips.append(WiredFt245(FAKE, terminal))
-        chips[-1].plug()
-        return chips[-1]
-
-    yield plug
-    for chip in chips:
-        chip.unplug()
-    wait_until(lambda: not find_terminal(FAKE), "the fake chip to be gone")
-
-
 @BOTH_PORTS
-def test_chip_that_sends_empty_packets(rig: Rig, plug: Callable[[Path], WiredFt245], raw: bool) -> None:
-    near, far = rig.vcan(), rig.vcan()
-    simulator, terminal = rig.simulate(far, adapter="usb2can")
-    chip = plug(terminal)
-    bridge = rig.bridge(configuration(address(FAKE, raw=raw), near))
-    bridge.wait_state("running")
-    assert_carries(rig, bridge, near, far, 300)
-    assert chip.idle_packets
-    bridge.stop_cleanly()
-    wait_terminal(FAKE)
-    assert simulator.stop() == 0
-
-
-def wait_flowing(bridge: Bridge) -> None:
-    """Wait until it runs, and fifty more frames have gone each way."""
-    before = bridge.wait_state("running")["counters"]
-    keys = ("rx_frames", "tx_frames")
-    bridge.wait_status(
-        lambda status: all(status["counters"][key] >= before[key] + 50 for key in keys), "frames both ways"
-    )
-
-
-class Plugged:
-    """A time of being plugged in. The power comes by the same cable: each time the adapter starts anew."""
-
-    def __init__(self, rig: Rig, seed: int) -> None:
-        self._seed = seed
-        files = (rig.directory / f"{seed}.state", rig.directory / f"{seed}.record")
-        options = ("--traffic", "100", "--seed", str(seed), "--state", files[0], "--record", files[1])
-        process, self.terminal = rig.simulate(None, *map(str, options), adapter="usb2can")
-        self._adapter = Adapter(process, *files)
-        self.since = time.time()
-
-    def end(self) -> None:
-        state = self._adapter.stop()
-        self.sent = self._adapter.recorded
-        self.taken: int = state["counters"]["frames_taken"]
-        self.heard = traffic(state["traffic"]["made_up"], self._seed)
-
-
-@BOTH_PORTS
-def test_unplug_and_plug_while_frames_flow(rig: Rig, plug: Callable[[Path], WiredFt245], raw: bool) -> None:
-    """Frames STEADY#… go all the time; of the BURST#… many still wait when the cable is pulled.
-
-    Not QEMU's chip: that crashes where it is unplugged while data comes.
-    """
-    near, times = rig.vcan(), [Plugged(rig, seed=0)]
-    chip = plug(times[0].terminal)
-    settings = configuration(address(FAKE, raw=raw), near, deadline=DEADLINE)
-    settings["channel"]["bitrate"] = 125_000  # where a burst takes its time
-    port = settings["adapter"]["port"]
-    dump = rig.candump(near)
-    bridge = rig.bridge(settings)
-    generator = rig.cangen(near, 1_000_000, "-e", "-I", STEADY, "-L", "8", "-D", "i", gap_ms=10)
-    for cycle in range(1, 4):
-        wait_flowing(bridge)
-        burst = rig.play(near, [f"{BURST}#{cycle:02X}{n:06X}" for n in range(BURST_LENGTH)])
-        assert burst.wait() == 0
-        chip.unplug()
-        too_old = time.time() + DEADLINE
-        wait_until(lambda n=cycle: bridge.err.count(f"port {port} lost: ") == n, "the loss to be told")  # type: ignore[misc]
-        times[-1].end()
-        wait_until(lambda t=too_old: newest(dump) > t, "what waits to be too old")  # type: ignore[misc]
-        times.append(Plugged(rig, seed=cycle))
-        chip = plug(times[-1].terminal)
-    wait_flowing(bridge)
-    generator.stop()
-    counters = balanced(bridge.wait_status(lambda status: status["queued"] == 0, "an empty queue"))
-    bridge.stop_cleanly()
-    wait_terminal(FAKE)
-    times[-1].end()
-
-    reason = f"{port}: unplugged" if raw else "(end of file or hang-up|Input/output error)"
-    assert len(re.findall(f"port {port} lost: {reason}", bridge.err)) == len(times) - 1
-    log = stamped(dump)
-    born = {frame: stamp for stamp, frame in log if frame.startswith((STEADY, BURST))}
-    assert all(born[frame] > plugged.since - DEADLINE for plugged in times for frame in plugged.sent)
-    for identifier in (STEADY, BURST):  # in order, and none twice; who listens sees two senders in any order
-        sent = [frame for plugged in times for frame in plugged.sent if frame.startswith(identifier)]
-        assert in_order(sent, (frame for frame in born if frame.startswith(identifier)))
-    assert not any(frame.startswith(BURST) for frame in times[-1].sent)
-    assert counters["tx_dropped"]["stale"] > 100
-    taken = sum(plugged.taken for plugged in times)
-    assert counters["tx_frames"] <= taken <= counters["tx_frames"] + counters["tx_dropped"]["unanswered"]
-    received = [frame for _, frame in log if frame not in born]
-    assert len(received) >= counters["rx_frames"]
-    assert in_order(received, [frame for plugged in times for frame in plugged.heard])
+def test_chip_that_sends_empty_packets(rig: Rig, raw: bool) -> None:
+    near, count = rig.vcan(), 300
+    there, back = mixed_frames(count, seed=3), traffic(count)
+    with plugged("usb2can", FAKE) as chip:
+        bridge = rig.bridge(configuration(address(FAKE, raw=raw), near))
+        bridge.wait_state("running")
+        player = rig.play(near, there)
+        wait_until(lambda: len(chip.life.sent) >= count, "all frames to be on its bus")
+        assert player.wait() == 0
+        arrived = rig.candump(near)
+        chip.hear(itertools.islice(serve.mixed_frames(random.Random(SEED)), count), fps=150)
+        assert_same_frames(arrived.finish(count), back)
+        assert_same_frames(chip.life.sent, there)
+        assert_sent(bridge, count)
+        assert chip.idle_packets
+        bridge.stop_cleanly()
+        wait_terminal(FAKE)
 
 
 def test_listen_only_with_a_filter(rig: Rig) -> None:
