@@ -86,7 +86,7 @@ class BusOff:
         pause_s = self.config.reconnect.initial_s
         cause = f"no frame has left the adapter for {limit_s:g} s"
         if self._adapter.flow is not None:
-            why = "does another node acknowledge them? Is the bus always busy?"
+            why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
             self._begin_anew(pause_s, f"{cause}, {frames} are in its buffer ({why}){ANEW}")
         elif now - polling.full_at <= limit_s:  # it cannot tell bus-off
             self.off(f"{cause} (does another node acknowledge them?), its status: {polling.description}")

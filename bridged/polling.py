@@ -58,6 +58,7 @@ class HealthPolling:
         self._stall = Stall(stuck_s)
         self._counters = counters
         self._overruns_seen = 0
+        self._noise_seen = 0
         self._asked_at = 0.0
         self._answer_times_s: deque[float] = deque(maxlen=ANSWER_TIMES)
         self._samples: deque[tuple[float, int, int]] = (
@@ -80,6 +81,7 @@ class HealthPolling:
         counters = self._counters()
         self._stall = Stall(self._stall.limit_s, counters["decoded"], counters["tx_frames"])
         self._overruns_seen = counters["rx_overruns"]
+        self._noise_seen = counters["skipped_bytes"]
         self._unknown = 0
         self.next_at = now
 
@@ -179,6 +181,11 @@ class HealthPolling:
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
             self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
             return
+        noise = counters["skipped_bytes"]
+        if noise != self._noise_seen:
+            self._noise_seen = noise
+            text = "noise on the line from the adapter"
+            self._warn("%s: a damaged cable, a wrong baud rate, or another program at its port", text)
         overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
             self._overruns_seen = overruns

@@ -125,10 +125,13 @@ class Can232:
 
     def _identify(self) -> Steps:
         for _ in range(3):
-            answer = yield self._step(b"V\r", "tell its version", (TEXT, NONE), (), prefix=b"V")
+            answer = yield self._step(b"V\r", "tell its version", (TEXT, REFUSED, NONE), (), prefix=b"V")
             if answer.reply is TEXT:
                 break
         else:
+            if answer.reply is REFUSED:
+                msg = f"the adapter on {self._port} refuses every command, V too: is it a CAN232, and well?"
+                raise AdapterError(msg)
             msg = (
                 f"no answer to V on {self._port} at {self.baudrate} Bd: is the adapter powered "
                 f"(from the CAN side, 6-16 V), the baud rate right (its LEDs blink it at power-on), "

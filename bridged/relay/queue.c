@@ -48,10 +48,12 @@ void queue_drop(struct relay *r, enum tx_drop reason)
     r->count.tx_dropped[reason]++;
 }
 
-/* Both lists are in order of age, so only their heads need a look. */
+/* Both lists are in order of age, so only their heads need a look. Where the adapter answers frames, nobody knows
+ * before a refusal was checked what became of the frame. */
 void queue_expire(struct relay *r, int64_t now)
 {
-    while (r->retry_count && now - retry_at(r, 0)->born_ns > r->set.deadline_ns) {
+    bool certain = flow_used(r) || !(r->checking || r->resyncing);
+    while (certain && r->retry_count && now - retry_at(r, 0)->born_ns > r->set.deadline_ns) {
         retry_pop(r);
         queue_drop(r, TX_REFUSED);
     }

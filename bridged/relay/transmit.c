@@ -24,6 +24,13 @@ static uint64_t line_noise(const struct relay *r)
     return r->count.skipped_bytes + r->count.stray_answers;
 }
 
+/* Noise since a refusal, before it was checked, may have been the answer that the frame was taken. */
+static void retry_disbelieve(struct relay *r)
+{
+    for (; r->retry_count && line_noise(r) != r->check_noise; retry_pop(r))
+        queue_drop(r, TX_UNANSWERED);
+}
+
 /* The oldest command in flight is over without an answer of its own. */
 static void inflight_give_up(struct relay *r)
 {
@@ -37,8 +44,10 @@ static void inflight_give_up(struct relay *r)
         r->polling = false;
     else if (head->kind == INFLIGHT_LEVEL)
         flow_unanswered(r);
-    else
+    else if (r->checking) {
         r->checking = false;
+        retry_disbelieve(r);
+    }
     r->inflight_head = (r->inflight_head + 1) % INFLIGHT_MAX;
     r->inflight_count--;
 }
@@ -169,8 +178,7 @@ static void inflight_settle(struct relay *r, enum event_kind how, const struct c
         break;
     case INFLIGHT_CHECK:
         r->checking = false;
-        for (; r->retry_count && line_noise(r) != r->check_noise; retry_pop(r))
-            queue_drop(r, TX_UNANSWERED);
+        retry_disbelieve(r);
         break;
     case INFLIGHT_SYNC:
         r->resyncing = r->checking = false;

@@ -33,6 +33,7 @@ class Bench:
         self.failed: list[str] = []
         self.off: list[str] = []
         self.counters = {"rx_overruns": 0, "rx_frames": 0, "tx_frames": 0, "decoded": 0}
+        self.counters["skipped_bytes"] = 0
         self.polling = HealthPolling(
             self.adapter,  # type: ignore[arg-type]
             0.25,

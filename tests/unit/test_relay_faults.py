@@ -145,3 +145,27 @@ def test_a_bell_amid_noise_is_not_believed(rig: Rig, before: bytes, after: bytes
     assert [line for line in rig.said() if line != b"V"] == []
     c = rig.counters()
     assert (c["unanswered"], c["queued"], c["tx_retries"]) == (1, 0, 0)
+
+
+@pytest.mark.parametrize("noise", [b"", b"\x8fq\r"])
+def test_a_bell_that_could_not_be_checked(rig: Rig, noise: bytes) -> None:
+    """With noise since, nobody knows whether the frame was taken."""
+    rig.bus.send(can_frame(1))
+    rig.turn()
+    rig.port.send(b"\a")
+    rig.turn()
+    rig.port.send(noise)
+    rig.turn(200)
+    c = rig.counters()
+    assert (c["unanswered"], c["refused"], c["queued"]) == (
+        0,
+        0,
+        1,
+    )  # too old, but who knows what became of it
+    rig.turn(200)
+    rig.port.send(b"V1324\r")
+    rig.turn()
+    rig.turn()
+    c = rig.counters()
+    assert (c["unanswered"], c["refused"], c["queued"]) == (bool(noise), not noise, 0)
+    assert [line for line in rig.said() if line != b"V"][1:] == []
