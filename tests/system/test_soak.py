@@ -38,6 +38,7 @@ FAULT_S = (0.5, 2.5)
 WARM_UP = 5  # phases
 LOOK_S = 0.05
 RETRY_S = 0.05
+MARK_S = 5.0  # for a frame to come through, or another is tried
 
 INTERFACE_FAULTS = ("interface down", "interface deleted")
 OTHERS = (*INTERFACE_FAULTS, "overload")
@@ -71,12 +72,18 @@ class Station(threading.Thread):
         self._stop_it = False
 
     def flood(self, count: int) -> None:
-        """Send so many frames at once."""
+        """Send so many frames at once, also while paused."""
         self._at_once = count
         self._waker.send(b"x")
 
+    def mark(self) -> str:
+        """Send one frame, while paused; which it is."""
+        self.flood(1)
+        wait_until(lambda: not self._at_once, "a frame to be sent")
+        return next(reversed(self.born))
+
     def pause(self) -> None:
-        """Send nothing until resume(); it is so when this returns."""
+        """Send nothing by itself until resume(); it is so when this returns."""
         self._quiet.clear()
         self._silence.set()
         self._waker.send(b"x")
@@ -104,8 +111,7 @@ class Station(threading.Thread):
             try:
                 self._socket = self._socket or open_can(self._interface)
                 self._listen(self._socket)
-                if not self._silence.is_set():
-                    self._send(self._socket)
+                self._send(self._socket)
             except (BusError, OSError) as error:
                 if self._socket and getattr(error, "errno", 0) != errno.ENETDOWN:  # that may come back
                     self._socket.close()
@@ -125,14 +131,13 @@ class Station(threading.Thread):
 
     def _send(self, bus: socket.socket) -> None:
         now = time.monotonic()
-        while self._at_once or self._next_at <= now:
-            if self._at_once:
-                self._at_once -= 1
-            else:
+        while self._at_once or (self._next_at <= now and not self._silence.is_set()):
+            if not self._at_once:
                 self._next_at = max(self._next_at, now - 1 / FPS) + 1 / FPS
             data = len(self.born).to_bytes(8, "big")
             bus.send(CAN_FRAME.pack(SENT | EXTENDED, len(data), data))
             self.born[f"{SENT:08X}#{data.hex().upper()}"] = time.time()
+            self._at_once -= self._at_once > 0
 
 
 class Side:
@@ -225,26 +230,39 @@ class Side:
         """Nobody sends for a moment, until all frames have gone somewhere: the counters agree with that."""
         self.station.pause()
         self.chip.hear()
-        gap = wait_until(self._settled, f"the books of {self.chip.adapter} to be balanced")
-        self._unread, self._unheard = gap[:2]
+        wait_until(self._marks_come, f"a last frame to come through each way: {self.bridge}")
+        counters = balanced(wait_until(self._idle, f"an empty queue: {self.bridge}"))
+        dropped = counters["tx_dropped"]
+        unread = len(self.station.born) - counters["bus_read"] - dropped.get("socket-overflow", 0)
+        unheard = counters["rx_frames"] - len(self.station.heard)
+        if self._kind in INTERFACE_FAULTS:  # sent or delivered while nobody could read it
+            assert unread >= self._unread
+            assert unheard >= self._unheard
+            self._unread, self._unheard = unread, unheard
+        assert (unread, unheard) == (self._unread, self._unheard), self._kind
+        taken = sum(life.taken for life in self.chip.lives)
+        assert counters["tx_frames"] <= taken <= counters["tx_frames"] + dropped["unanswered"], self._kind
         self.resources.append(self.bridge.resources())
         self.station.resume()
         self.chip.hear(self._others, FPS)
 
-    def _settled(self) -> Sequence[int]:
-        """How much was sent and never read, delivered and never heard: more if the interface was away."""
+    def _marks_come(self) -> bool:
+        """Whether a frame comes through each way: what was sent before it has come, or never will."""
+        sent, heard = self.station.mark(), next(self._others)
+        self.chip.hear([heard])
+        until = time.monotonic() + MARK_S
+        while time.monotonic() < until:
+            time.sleep(LOOK_S)
+            self.look()
+            handed = self.chip.life.handed[-1:]
+            if self.station.heard[-1:] == [record_line(heard).strip()] and handed and handed[0][1] == sent:
+                return True
+        return False
+
+    def _idle(self) -> dict[str, Any]:
+        """The status, once it runs and nothing waits."""
         status = self.look()
-        if status["state"] != "running" or status["queued"]:
-            return ()
-        counters = balanced(status)
-        dropped = counters["tx_dropped"]
-        unread = len(self.station.born) - counters["bus_read"] - dropped.get("socket-overflow", 0)
-        unheard = counters["rx_frames"] - len(self.station.heard)
-        taken = sum(life.taken for life in self.chip.lives)
-        assert counters["tx_frames"] <= taken <= counters["tx_frames"] + dropped["unanswered"]
-        if self._kind in INTERFACE_FAULTS:
-            return (unread, unheard, 1) if unread >= self._unread and unheard >= self._unheard else ()
-        return (unread, unheard, 1) if (unread, unheard) == (self._unread, self._unheard) else ()
+        return status if status["state"] == "running" and not status["queued"] else {}
 
     def assert_all(self) -> None:
         """After the end: on both buses all came from the other one, in its order, and nothing too late."""
