@@ -62,7 +62,7 @@ def wait_return(chip: WiredAdapter, node: Callable[[], Path | None]) -> tuple[fl
 
 
 def tell(what: str, seconds: list[float]) -> None:
-    """For those who read along."""
+    """For those who read along: all of them; the median."""
     median = statistics.median(seconds)
     print(f"{what}: {' '.join(f'{n:.2f}' for n in seconds)}; median {median:.3f} s")
 
@@ -84,11 +84,14 @@ def assert_sent(lives: list[Life], born: dict[str, float], counters: dict[str, A
     assert dropped["adapter-away"] > 100
 
 
-def replug(rig: Rig, adapter: str, cycles: int, *, raw: bool = False) -> list[float]:
-    """How long it took each time until frames flowed again. STEADY#… flow all the time, and HEARD#… back.
-
-    Of the BURST#… many still wait when the cable is pulled.
-    """
+@pytest.mark.parametrize(
+    ("adapter", "raw", "cycles"),
+    [("can232", False, 50), ("usb2can", False, 25), ("usb2can", True, 25)],
+    ids=["can232", "usb2can", "usb2can-libusb"],
+)
+def test_unplug_and_plug_while_frames_flow(rig: Rig, adapter: str, raw: bool, cycles: int) -> None:
+    """Frames STEADY#… go all the time; of the BURST#… many still wait when the cable is pulled."""
+    no_huge_pages()
     near, draw = rig.vcan(), random.Random(1)
     find = find_device if raw else find_terminal
 
@@ -100,7 +103,7 @@ def replug(rig: Rig, adapter: str, cycles: int, *, raw: bool = False) -> list[fl
         chip.hear(numbered_frames())
         port = f"usb://0403:6001/{FAKE}" if raw else str(wait_terminal(FAKE))
         dump = rig.candump(near)
-        bridge = rig.bridge(configuration(adapter, port, near), name="libusb" if raw else "tty")
+        bridge = rig.bridge(configuration(adapter, port, near))
         bridge.wait_state("running")
         steady = ("-e", "-I", STEADY, "-L", "8", "-D", "i")
         generator = rig.cangen(near, 10_000_000, *steady, gap_ms=STEADY_GAP_MS)
@@ -119,7 +122,7 @@ def replug(rig: Rig, adapter: str, cycles: int, *, raw: bool = False) -> list[fl
         wait_flowing(bridge, FLOW)
         resources.append(bridge.resources())
         generator.stop()
-        chip.hear()
+        chip.hear(())
         bridge.wait_status(lambda status: status["queued"] == 0, "an empty queue")
         counters = balanced(bridge.read_status())
         bridge.stop_cleanly()
@@ -136,14 +139,3 @@ def replug(rig: Rig, adapter: str, cycles: int, *, raw: bool = False) -> list[fl
     assert [life.device.report().get("violations", []) for life in chip.lives] == [[]] * (cycles + 1)
     assert chip.eeprom.writes <= 1
     assert_flat(resources[WARM_UP:])
-    return [flowing_s for _, flowing_s in returns]
-
-
-def test_can232(rig: Rig) -> None:
-    no_huge_pages()
-    assert len(replug(rig, "can232", 50)) == 50
-
-
-def test_usb2can(rig: Rig) -> None:
-    no_huge_pages()
-    assert len(replug(rig, "usb2can", 25) + replug(rig, "usb2can", 25, raw=True)) == 50
