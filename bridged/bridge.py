@@ -28,7 +28,7 @@ from bridged.errors import PortError
 from bridged.exchanges import REPLIES, Exchanges
 from bridged.health import BusState
 from bridged.lifecycle import Action, Backoff, Event, State, Told, repeated, transition
-from bridged.polling import HealthPolling
+from bridged.polling import NOISE, NOISE_CAUSES, HealthPolling
 from bridged.ports import open_port
 from bridged.ports.watch import Watch
 from bridged.status import LOST_BEFORE_READ
@@ -47,6 +47,8 @@ STOP_S = 1.2  # for an adapter that does not answer; systemd and users wait for 
 
 # States that end at once when the device is plugged in.
 LOOKING_OUT = frozenset({State.WAITING, State.BACKOFF, State.FAULT})
+# What the adapter did, or did not, led to them.
+FAILING = frozenset({State.CLOSING, State.REJECTING})
 # Their reason is that of the failure before.
 AFTERMATH = LOOKING_OUT | {State.BUS_OFF}
 
@@ -147,7 +149,7 @@ class Bridge:
             self._dispatch(Event.APPEARED)
 
     def next_timer(self) -> float | None:
-        timers = (self._timer, self._bus_end.next_at, self._polling.next_at)
+        timers = (self._timer, self._bus_end.next_at, self._polling.next_at, self._exchanges.next_at)
         return min((t for t in timers if t is not None), default=None)
 
     def on_timer(self, now: float) -> None:
@@ -158,6 +160,7 @@ class Bridge:
             self._dispatch(Event.RESTART)
         self._start_with_bus()
         self._polling.on_timer(now)
+        self._exchanges.on_timer(now)
 
     def has_turned(self) -> bool:
         """Whether the relay has turned since the last call, which gave it cause to; waits if a turn hangs."""
@@ -264,6 +267,8 @@ class Bridge:
 
     def _log_transition(self, reason: str) -> None:
         """One line; retries, and what is repeated too often, for those who look for a fault only."""
+        if self._polling.heard_noise() and reason and self.state in FAILING:
+            reason += f"; there is {NOISE} ({NOISE_CAUSES})"
         self.reason = reason or (self.reason if self.state in AFTERMATH else "")
         cause = re.sub(r"\d+", "#", reason)  # counts differ from time to time
         times = self._told.tell(cause, time.monotonic()) if reason else None

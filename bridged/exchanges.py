@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from typing import TYPE_CHECKING
 
 from bridged import _relay
@@ -37,6 +38,7 @@ class Exchanges:
         self._pending: dict[int, Callable[[Answer], None]] = {}
         self._steps: Steps | None = None
         self._end = Event.CLOSED
+        self.next_at: float | None = None  # the end of a pause between two steps, time.monotonic()
 
     @property
     def running(self) -> bool:
@@ -54,7 +56,7 @@ class Exchanges:
 
     def run(self, steps: Steps, end: Event) -> None:
         """Performs them one after the other; a step that was under way is forgotten, its answer awaited."""
-        self._pending.clear()
+        self.forget()
         self._steps = steps
         self._end = end
         self._advance(None)
@@ -69,6 +71,12 @@ class Exchanges:
         """Nobody waits for anything any more."""
         self._steps = None
         self._pending.clear()
+        self.next_at = None
+
+    def on_timer(self, now: float) -> None:
+        if self.next_at is not None and self.next_at <= now:
+            self.next_at = None
+            self._advance(Answer(Reply.NONE))
 
     def _advance(self, answer: Answer | None) -> None:
         steps = self._steps
@@ -83,6 +91,9 @@ class Exchanges:
         except AdapterError as error:
             self._dispatch(Event.UNANSWERED, str(error))
         else:
+            if not exchange.request:
+                self.next_at = time.monotonic() + exchange.timeout_s
+                return
             self.ask(exchange, lambda reply: self._on_step_answer(exchange, reply))
 
     def _on_step_answer(self, exchange: Exchange, answer: Answer) -> None:

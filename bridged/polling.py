@@ -24,6 +24,8 @@ LOG_INTERVAL_S = 10.0
 RATE_PERIOD_S = 1.0
 ANSWER_TIMES = 256
 UNKNOWN_LIMIT = 4
+NOISE = "noise on the line from the adapter"
+NOISE_CAUSES = "a damaged cable, a wrong baud rate, or another program at its port"
 
 
 class HealthPolling:
@@ -139,6 +141,11 @@ class HealthPolling:
             self._overtaken = self._overtaken or seen.state is not None
             self._take(seen)
 
+    def heard_noise(self) -> bool:
+        """Whether bytes without meaning came since the last look, and since this was asked last."""
+        before, self._noise_seen = self._noise_seen, self._counters()["skipped_bytes"]
+        return self._noise_seen != before
+
     def _look(self) -> None:
         self.next_at = None
         self._overtaken = False
@@ -181,11 +188,8 @@ class HealthPolling:
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
             self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
             return
-        noise = counters["skipped_bytes"]
-        if noise != self._noise_seen:
-            self._noise_seen = noise
-            text = "noise on the line from the adapter"
-            self._warn("%s: a damaged cable, a wrong baud rate, or another program at its port", text)
+        if self.heard_noise():
+            self._warn(f"%s ({NOISE_CAUSES})", NOISE)
         overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
             self._overruns_seen = overruns

@@ -31,6 +31,11 @@ class Exchange(NamedTuple):
     opens: bool = False  # the channel: frames that come from now on are received
 
 
+def pause(seconds: float) -> Exchange:
+    """A step that says nothing, and is answered by NONE when this time is over."""
+    return Exchange(b"", "wait", (Reply.NONE,), (), timeout_s=seconds)
+
+
 class Answer(NamedTuple):
     """What came back for an exchange."""
 

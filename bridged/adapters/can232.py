@@ -6,7 +6,18 @@ import logging
 import re
 from typing import TYPE_CHECKING
 
-from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Memory, Polling, Reply, Steps
+from bridged.adapters.base import (
+    Answer,
+    Exchange,
+    Flow,
+    HealthSteps,
+    Identity,
+    Memory,
+    Polling,
+    Reply,
+    Steps,
+    pause,
+)
 from bridged.errors import AdapterError, WrongDeviceError
 from bridged.health import UNKNOWN, BusState, Happened, Observation
 
@@ -24,6 +35,8 @@ LONGEST_LINE = 27  # "T1FFFFFFF81122334455667788\r"
 RECEIVE_FIFO = 32  # frames that may be on their way out before an answer (manual 1.3)
 AUTO_POLL_SINCE = "1220"  # hhss of the first firmware with X (manual 2.0, P and A)
 POLL_INTERVAL_S = 0.01
+TRANSMIT_FIFO = 8  # frames (manual 1.3)
+LONGEST_FRAME_BITS = 160  # extended, 8 bytes, as many stuff bits as there can be, the pause behind it
 
 # A command that a crashed program left half typed is in the device's buffer. A CR would finish it: a
 # frame from another time goes out on a live bus. A "C" might even complete it, being a hex digit. "V"
@@ -107,7 +120,14 @@ class Can232:
             self.polling = Polling(b"A\r", b"A", POLL_INTERVAL_S)
 
     def close_steps(self) -> Steps:
-        """`C` until it is certain: the first may end a half command or meet an old answer."""
+        """`C` until it is certain: the first may end a half command or meet an old answer.
+
+        C throws away what is in the transmit FIFO, and those frames are answered: so it comes once they are
+        on the bus, if others take up no more than half of it.
+        """
+        answer = yield self._step(b"F\r", "answer all before", ANYTHING, (), prefix=b"F")
+        if answer.reply is TEXT:
+            yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
         yield from self._close()
         answer = yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
         if answer.reply is NONE:

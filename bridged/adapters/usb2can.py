@@ -6,7 +6,7 @@ import logging
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Polling, Reply, Steps
+from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Polling, Reply, Steps, pause
 from bridged.errors import AdapterError, WrongDeviceError
 from bridged.health import UNKNOWN, BusState, Happened, Observation, state_of
 
@@ -149,7 +149,7 @@ class Usb2can:
         )
 
     def _drain(self) -> Steps:
-        """Waits while frames leave its transmit buffer; a pause is a question whose answer is not awaited."""
+        """Waits while frames leave its transmit buffer."""
         fewest, looks = 255, DRAIN_LOOKS
         for _ in range(DRAIN_LOOKS_MAX):
             levels = yield from self._read_levels()
@@ -159,7 +159,7 @@ class Usb2can:
             fewest = min(fewest, levels.waiting)
             if not looks:
                 break
-            yield Exchange(message(GET_MODE), "wait", (NONE,), (), timeout_s=DRAIN_INTERVAL_S)
+            yield pause(DRAIN_INTERVAL_S)
         self.discarded += fewest
 
     def _in_config_mode(self, request: bytes) -> Exchange:

@@ -94,6 +94,10 @@ class Rig:
                 return
             accepted = sum(accept.get(reply, 0) for reply in set(exchange.accept + exchange.reject))
             self._relay_next = self.now
+            if not exchange.request:
+                self.run(exchange.timeout_s)
+                answer = Answer(Reply.NONE)
+                continue
             self.relay.command(1, exchange.request, accepted, exchange.prefix, exchange.timeout_s)
             answer = None
             while answer is None:
