@@ -46,11 +46,11 @@ LAST_WORDS_S = 0.1
 STOP_S = 1.2  # for an adapter that does not answer; systemd and users wait for the end
 
 # States that end at once when the device is plugged in.
-LOOKING_OUT = frozenset({State.WAITING, State.BACKOFF, State.FAULT})
+LOOKING_OUT = (State.WAITING, State.BACKOFF, State.FAULT)
 # What the adapter did, or did not, led to them.
-FAILING = frozenset({State.CLOSING, State.REJECTING})
+FAILING = (State.CLOSING, State.REJECTING)
 # Their reason is that of the failure before.
-AFTERMATH = LOOKING_OUT | {State.BUS_OFF}
+AFTERMATH = (*LOOKING_OUT, State.BUS_OFF)
 
 
 def _reason(error: int) -> str:

@@ -22,7 +22,6 @@ REPLIES = {
     _relay.EVENT_TEXT: Reply.TEXT,
     _relay.EVENT_TIMEOUT: Reply.NONE,
 }
-ACCEPT = {Reply.OK: _relay.ACCEPT_OK, Reply.REFUSED: _relay.ACCEPT_REFUSED}
 
 
 class Exchanges:
@@ -51,7 +50,8 @@ class Exchanges:
         token = next(self._tokens) & 0xFFFFFFFF
         self._pending[token] = then
         replies = exchange.accept + exchange.reject
-        accept = sum(ACCEPT.get(reply, 0) for reply in set(replies))
+        accept = _relay.ACCEPT_OK if Reply.OK in replies else 0
+        accept |= _relay.ACCEPT_REFUSED if Reply.REFUSED in replies else 0
         self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s)
 
     def run(self, steps: Steps, end: Event) -> None:

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import enum
 import struct
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 WARNING_LIMIT = 96
 PASSIVE_LIMIT = 128
@@ -96,20 +99,24 @@ class Health:
 
     def observe(self, seen: Observation, now_s: float) -> list[bytes]:
         """Take it in; the error frames (struct can_frame) that tell the bus what is new."""
-        frames = []
+        frames: list[bytes] = []
         if seen.tec is not None:
             self.tec, self.rec = seen.tec, seen.rec
-        for what in seen.happened:
-            name = str(what.name).lower()
-            self.happened[name] = self.happened.get(name, 0) + 1
-        if seen.happened & Happened.RESTARTED:
-            self.restarts += 1
-            frames.append(error_frame(CAN_ERR_RESTARTED))
-        if notice := _notice(seen.happened):
-            frames.append(notice)
+        if seen.happened is not Happened.NOTHING:  # seldom, and enum.Flag is slow
+            frames += self._happened(seen.happened)
         if self._changed(seen, now_s):
             frames.append(self._state_frame())
         return frames
+
+    def _happened(self, happened: Happened) -> Iterator[bytes]:
+        for what in happened:
+            name = str(what.name).lower()
+            self.happened[name] = self.happened.get(name, 0) + 1
+        if happened & Happened.RESTARTED:
+            self.restarts += 1
+            yield error_frame(CAN_ERR_RESTARTED)
+        if notice := _notice(happened):
+            yield notice
 
     def _changed(self, seen: Observation, now_s: float) -> bool:
         before, state = self.state, seen.state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import time
@@ -16,7 +17,7 @@ from bridged.lifecycle import Told, repeated
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bridged.adapters.base import Adapter, Answer, Exchange, HealthSteps
+    from bridged.adapters.base import Adapter, Answer, Exchange
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +30,7 @@ NOISE_CAUSES = "a damaged cable, a wrong baud rate, or another program at its po
 
 
 class HealthPolling:
-    """One question at a time, the next one `interval_s` after the last answer.
+    """All questions at once, and again `interval_s` after the last answer.
 
     `ask` sends an exchange and calls back with its answer; `tell` puts an error frame on the bus; `failed`
     hears why the adapter must be initialised again, `bus_off` that it is bus-off, or gets rid of no frame for
@@ -66,7 +67,7 @@ class HealthPolling:
         self._samples: deque[tuple[float, int, int]] = (
             deque()
         )  # time, frames to the bus, frames to the adapter
-        self._steps: HealthSteps | None = None
+        self._answers: list[Answer | None] | None = None  # of the questions that are being asked
         self._unknown = 0  # looks one after the other without an answer
         self.description = ""  # what the adapter said last
         self.full_at = -math.inf  # when it said last that its transmit buffer was full
@@ -90,7 +91,7 @@ class HealthPolling:
     def stop(self) -> None:
         """The adapter is no more: whatever it still answers is of no interest."""
         self.next_at = None
-        self._steps = None
+        self._answers = None
         self._refused = False
         self._samples.clear()
         self.health.forget()
@@ -129,7 +130,7 @@ class HealthPolling:
     def heard(self, text: bytes) -> None:
         """What the adapter said unasked."""
         log.debug("adapter said %r unasked", text)
-        if self.next_at is None and self._steps is None:
+        if self.next_at is None and self._answers is None:
             return
         try:
             seen = self._adapter.read_report(text)
@@ -143,34 +144,41 @@ class HealthPolling:
 
     def heard_noise(self) -> bool:
         """Whether bytes without meaning came since the last look, and since this was asked last."""
-        before, self._noise_seen = self._noise_seen, self._counters()["skipped_bytes"]
-        return self._noise_seen != before
+        return self._is_news(self._counters()["skipped_bytes"])
+
+    def _is_news(self, noise: int) -> bool:
+        before, self._noise_seen = self._noise_seen, noise
+        return noise != before
 
     def _look(self) -> None:
         self.next_at = None
         self._overtaken = False
-        self._steps = self._adapter.health_steps()
-        self._advance(None)
+        questions = self._adapter.health_questions()
+        answers: list[Answer | None] = [None] * len(questions)
+        self._answers = answers
+        self._asked_at = time.monotonic()
+        for number, question in enumerate(questions):
+            self._ask(question, functools.partial(self._answered, answers, number))
 
-    def _advance(self, answer: Answer | None) -> None:
-        if self._steps is None:
+    def _answered(self, answers: list[Answer | None], number: int, answer: Answer) -> None:
+        if answers is not self._answers:
             return
-        if answer and answer.reply is not Reply.NONE:
-            self._answer_times_s.append(time.monotonic() - self._asked_at)
+        answers[number] = answer
+        now = time.monotonic()
+        if number == 0 and answer.reply is not Reply.NONE:
+            self._answer_times_s.append(now - self._asked_at)
         try:
-            exchange = self._steps.send(answer) if answer else next(self._steps)
-        except StopIteration as end:
-            self._steps = None
-            self.next_at = time.monotonic() + self._interval_s
-            self._looked(end.value)
+            seen = self._adapter.read_health(answers)
         except AdapterError as error:
-            self._steps = None
+            self._answers = None
             self._failed(str(error))
-        else:
-            self._asked_at = time.monotonic()
-            self._ask(exchange, self._advance)
+            return
+        if seen is not None:
+            self._answers = None
+            self.next_at = now + self._interval_s
+            self._looked(seen, now)
 
-    def _looked(self, seen: Observation) -> None:
+    def _looked(self, seen: Observation, now: float) -> None:
         if self._refused:
             self._refused = False
             self._warn("adapter refuses frames; its status: %s", seen.description)
@@ -182,13 +190,12 @@ class HealthPolling:
             self._failed("the adapter does not answer questions about its bus")
             return
         counters = self._counters()
-        now = time.monotonic()
         self._sample(now, counters["rx_frames"], counters["tx_frames"])
         if self._stall.observe(seen, now, counters["decoded"], counters["tx_frames"]):
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
             self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
             return
-        if self.heard_noise():
+        if self._is_news(counters["skipped_bytes"]):
             self._warn(f"%s ({NOISE_CAUSES})", NOISE)
         overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
@@ -204,7 +211,7 @@ class HealthPolling:
 
     def _take(self, seen: Observation) -> None:
         self.description = seen.description
-        if seen.happened & Happened.TX_FULL:
+        if seen.happened is not Happened.NOTHING and seen.happened & Happened.TX_FULL:
             self.full_at = time.monotonic()
         before = self.health.state
         for frame in self.health.observe(seen, time.monotonic()):

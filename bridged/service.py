@@ -87,6 +87,7 @@ class Service:
         self._successor: Bridge | None = None  # waits for the end of `bridge`
         self._ready = False
         self._status = ""
+        self._told: tuple[object, ...] = ()
         self._refusal = ""  # why the last reload was refused
         self._feed_at: float | None = None
 
@@ -189,6 +190,10 @@ class Service:
 
     def _tell(self) -> None:
         state, reason, bus_open = self.bridge.condition()
+        told = (self.bridge, state, reason, bus_open, self._refusal)
+        if told == self._told:
+            return
+        self._told = told
         self._status = _describe(self.bridge, state, reason, bus_open=bus_open) or self._status
         refusal = f" (reload refused: {self._refusal})" if self._refusal else ""
         self._notifier.status(self._status + refusal)

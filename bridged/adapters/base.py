@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Generator
-from typing import NamedTuple, Protocol
+from collections.abc import Generator, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from bridged.health import Observation
+if TYPE_CHECKING:
+    from bridged.health import Observation
 
 
 class Reply(enum.Enum):
@@ -76,7 +77,6 @@ class Memory(Protocol):
 
 
 Steps = Generator[Exchange, Answer, None]
-HealthSteps = Generator[Exchange, Answer, Observation]
 
 
 class Adapter(Protocol):
@@ -101,8 +101,14 @@ class Adapter(Protocol):
     def close_steps(self) -> Steps:
         """From whatever state to a closed channel; the steps accept every answer."""
 
-    def health_steps(self) -> HealthSteps:
-        """Asks what the device thinks of its bus. AdapterError: it must be initialised again."""
+    def health_questions(self) -> tuple[Exchange, ...]:
+        """To be asked at once, to know what the device thinks of its bus."""
+
+    def read_health(self, answers: Sequence[Answer | None]) -> Observation | None:
+        """What it answered, in the order of the questions; None: it takes more of the answers to know.
+
+        AdapterError: it must be initialised again.
+        """
 
     def saw_time_stamps(self) -> None:
         """Frames with time stamps came, which nobody asked for."""
@@ -111,4 +117,4 @@ class Adapter(Protocol):
         """Bytes that mean nothing came while the adapter is being initialised."""
 
     def read_report(self, text: bytes) -> Observation | None:
-        """What the device said unasked; None if there is nothing to it. AdapterError as health_steps."""
+        """What the device said unasked; None if there is nothing to it. AdapterError as read_health."""

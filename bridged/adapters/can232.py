@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import re
 from typing import TYPE_CHECKING
@@ -10,7 +11,6 @@ from bridged.adapters.base import (
     Answer,
     Exchange,
     Flow,
-    HealthSteps,
     Identity,
     Memory,
     Polling,
@@ -22,7 +22,7 @@ from bridged.errors import AdapterError, WrongDeviceError
 from bridged.health import UNKNOWN, BusState, Happened, Observation
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Sequence
 
     from bridged.config import Can232Config, ChannelConfig
 
@@ -84,6 +84,7 @@ class Can232:
         self.polling: Polling | None = None
         # An answer may stand behind a full receive FIFO on the line: 10 bit times a character.
         self.answer_timeout_s = 0.2 + RECEIVE_FIFO * LONGEST_LINE * 10 / adapter.baudrate
+        self._flags_step = self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F")
         self.sync = self._step(b"V\r", "tell its version", (TEXT,), (NONE,), prefix=b"V")
 
     def _step(
@@ -125,7 +126,7 @@ class Can232:
         C throws away what is in the transmit FIFO, and those frames are answered: so it comes once they are
         on the bus, if others take up no more than half of it.
         """
-        answer = yield self._step(b"F\r", "answer all before", ANYTHING, (), prefix=b"F")
+        answer = yield self._flags_step  # it comes after those of all frames
         if answer.reply is TEXT:
             yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
         yield from self._close()
@@ -245,23 +246,14 @@ class Can232:
 
     # --- health -------------------------------------------------------------------------------
 
-    def health_steps(self) -> HealthSteps:
-        """`F`; reading clears the flags: they say what happened since the last time, not what is."""
-        answer = yield self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F")
-        if answer.reply is REFUSED:
+    def health_questions(self) -> tuple[Exchange, ...]:
+        return (self._flags_step,)
+
+    def read_health(self, answers: Sequence[Answer | None]) -> Observation | None:
+        (answer,) = answers
+        if answer is not None and answer.reply is REFUSED:
             raise AdapterError("the adapter's channel is closed: it was reset, or lost its power")
-        if not re.fullmatch(b"F[0-9A-Fa-f]{2}", answer.text):
-            return UNKNOWN
-        flags = int(answer.text[1:], 16)
-        happened = Happened.NOTHING
-        for bit, what in HAPPENED.items():
-            if flags >> bit & 1:
-                happened |= what
-        state = max(
-            (state for bit, state in STATES.items() if flags >> bit & 1), default=BusState.ERROR_ACTIVE
-        )
-        text = ", ".join(text for bit, text in STATUS_FLAGS.items() if flags >> bit & 1) or "no flags"
-        return Observation(text, state, lasting=False, happened=happened)
+        return None if answer is None else _read_flags(answer.text)
 
     def saw_time_stamps(self) -> None:
         if self._stamped:
@@ -275,3 +267,18 @@ class Can232:
 
     def read_report(self, text: bytes) -> Observation | None:  # noqa: ARG002 - it never speaks unasked
         return None
+
+
+@functools.lru_cache(maxsize=16)
+def _read_flags(answer: bytes) -> Observation:
+    """`F` and two hex digits. Reading clears the flags: they say what happened since, not what is."""
+    if not re.fullmatch(b"F[0-9A-Fa-f]{2}", answer):
+        return UNKNOWN
+    flags = int(answer[1:], 16)
+    happened = Happened.NOTHING
+    for bit, what in HAPPENED.items():
+        if flags >> bit & 1:
+            happened |= what
+    state = max((state for bit, state in STATES.items() if flags >> bit & 1), default=BusState.ERROR_ACTIVE)
+    text = ", ".join(text for bit, text in STATUS_FLAGS.items() if flags >> bit & 1) or "no flags"
+    return Observation(text, state, lasting=False, happened=happened)

@@ -6,12 +6,12 @@ import logging
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from bridged.adapters.base import Answer, Exchange, Flow, HealthSteps, Identity, Polling, Reply, Steps, pause
+from bridged.adapters.base import Answer, Exchange, Flow, Identity, Polling, Reply, Steps, pause
 from bridged.errors import AdapterError, WrongDeviceError
 from bridged.health import UNKNOWN, BusState, Happened, Observation, state_of
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Sequence
 
     from bridged.config import ChannelConfig, Usb2canConfig
 
@@ -97,7 +97,7 @@ class Usb2can:
         self._channel = channel
         self._noise = bytearray()
         self._levels_prefix: bytes | None = None  # how this firmware begins its answer to COMMAND GET
-        self._health: dict[int, Exchange] = {}  # what is asked to know how the bus is
+        self._health: dict[int, Exchange] = {}  # command and what is asked to know how the bus is
         self.discarded = 0
         self._restarts: bytes | None = None  # as READ_RST tells them: in which byte order is not said
         self._mode_exchange = _exchange(
@@ -327,20 +327,24 @@ class Usb2can:
             if command == READ_RST:
                 self._restarts = answer.text[2:]
 
-    def health_steps(self) -> HealthSteps:
+    def health_questions(self) -> tuple[Exchange, ...]:
         """Its mode, error counters, restarts after bus-off, and whether it is bus-off now."""
-        mode = yield self._mode_exchange
-        if mode.reply is TEXT and mode.text[2] != NORMAL:
+        return self._mode_exchange, *self._health.values()
+
+    def read_health(self, answers: Sequence[Answer | None]) -> Observation | None:
+        mode = answers[0]
+        if mode and mode.reply is TEXT and mode.text[2] != NORMAL:
             raise AdapterError(_wrong_mode(mode.text[2]))
-        answers = {}
-        for command, exchange in self._health.items():
-            answers[command] = (yield exchange).text[2:]
-        if mode.reply is NONE or not all(answers.values()):
+        if None in answers:
+            return None
+        texts = [answer.text[2:] for answer in answers if answer]
+        if not all(texts):
             return UNKNOWN
-        restarted = answers.get(READ_RST) != self._restarts
-        self._restarts = answers.get(READ_RST)
-        tec, rec = answers.get(READ_TEC), answers.get(READ_REC)
-        status = answers.get(READ_REG)
+        told = dict(zip(self._health, texts[1:], strict=True))
+        restarted = told.get(READ_RST) != self._restarts
+        self._restarts = told.get(READ_RST)
+        tec, rec = told.get(READ_TEC), told.get(READ_REC)
+        status = told.get(READ_REG)
         bus_off = bool(status and status[-1] & BUS_STATUS)
         return _observation(
             "bus-off" if bus_off else "bus good",

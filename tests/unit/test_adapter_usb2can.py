@@ -17,7 +17,7 @@ from usb2can_host import (
 from usb2can_words import LOOPBACK, OPEN, SETUP, WRITTEN, ask, opened
 
 from bridged import _relay
-from bridged.adapters.base import Reply
+from bridged.adapters.base import Answer, Reply
 from bridged.adapters.usb2can import BUS_OFF, ERROR, GET_MODE, Usb2can
 from bridged.can import AcceptanceFilter, BitTiming, bit_timing
 from bridged.errors import AdapterError, WrongDeviceError
@@ -444,14 +444,15 @@ def test_a_silent_device_is_not_waited_for() -> None:
 
 
 def looked(host: Host) -> Observation:
-    """What health_steps find out."""
-    steps = host.adapter.health_steps()
-    exchange = next(steps)
-    while True:
-        try:
-            exchange = steps.send(host.ask(exchange.request, exchange.prefix, exchange.timeout_s))
-        except StopIteration as end:
-            return end.value
+    """What the answers to the health questions say."""
+    questions = host.adapter.health_questions()
+    answers: list[Answer | None] = [None] * len(questions)
+    for number, question in enumerate(questions):
+        assert host.adapter.read_health(answers) is None
+        answers[number] = host.ask(question.request, question.prefix, question.timeout_s)
+    seen = host.adapter.read_health(answers)
+    assert seen
+    return seen
 
 
 def test_health(device: Device) -> None:

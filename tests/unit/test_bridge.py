@@ -397,7 +397,7 @@ def test_a_bug_in_the_bridge_still_ends_it_and_closes_the_channel(
     def bug() -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(bridge.adapter, "health_steps", bug)
+    monkeypatch.setattr(bridge.adapter, "health_questions", bug)
     with pytest.raises(ZeroDivisionError):
         serve(bridge, None)
     while bench.device.state is not Channel.CLOSED:

@@ -1,6 +1,8 @@
-"""Questions about the bus, one at a time, and what becomes of the answers."""
+"""Questions about the bus, and what becomes of the answers."""
 
-from bridged.adapters.base import Answer, Exchange, HealthSteps, Reply
+from collections.abc import Sequence
+
+from bridged.adapters.base import Answer, Exchange, Reply
 from bridged.errors import AdapterError
 from bridged.health import BusState, Observation, error_frame
 from bridged.polling import HealthPolling
@@ -14,9 +16,12 @@ class Adapter:
         self.report: Observation | None = None
         self.broken = False
 
-    def health_steps(self) -> HealthSteps:
-        for _ in range(2):
-            yield Exchange(b"?", "tell", (Reply.TEXT,))
+    def health_questions(self) -> tuple[Exchange, ...]:
+        return (Exchange(b"?", "tell", (Reply.TEXT,)),) * 2
+
+    def read_health(self, answers: Sequence[Answer | None]) -> Observation | None:
+        if None in answers:
+            return None
         if self.broken:
             raise AdapterError("channel closed")
         return self.seen
@@ -57,11 +62,11 @@ class Bench:
             self.answer()
 
 
-def test_one_question_at_a_time_and_the_next_round_only_after_the_last_answer() -> None:
+def test_all_questions_at_once_and_the_next_round_only_after_the_last_answer() -> None:
     bench = Bench()
     bench.polling.on_timer(1e9)
     bench.polling.frame_refused()
-    assert len(bench.asked) == 1
+    assert len(bench.asked) == 2
     bench.answer()
     bench.polling.on_timer(1e9)
     assert len(bench.asked) == 1
@@ -69,7 +74,20 @@ def test_one_question_at_a_time_and_the_next_round_only_after_the_last_answer() 
     assert bench.asked == []
     assert bench.polling.health.state is BusState.ERROR_ACTIVE
     bench.polling.on_timer(1e9)
-    assert len(bench.asked) == 1
+    assert len(bench.asked) == 2
+
+
+def test_answers_of_a_round_that_is_over_mean_nothing() -> None:
+    bench = Bench()
+    bench.answer()
+    bench.polling.stop()
+    bench.polling.start(0.0)
+    bench.polling.on_timer(0.0)
+    bench.answer()  # of the round before
+    assert bench.polling.health.state is None
+    bench.answer()
+    bench.answer()
+    assert bench.polling.health.state is BusState.ERROR_ACTIVE
 
 
 def test_answers_older_than_what_the_adapter_says_by_itself_are_not_believed() -> None:
@@ -87,7 +105,7 @@ def test_a_frame_refused_between_two_rounds_is_explained_at_once() -> None:
     bench.answer()
     bench.answer()
     bench.polling.frame_refused()
-    assert len(bench.asked) == 1
+    assert len(bench.asked) == 2
 
 
 def test_what_says_that_it_must_be_initialised_again() -> None:
@@ -131,6 +149,7 @@ def test_restart_is_told_to_the_bus() -> None:
 def test_an_answer_after_the_end_means_nothing() -> None:
     bench = Bench()
     bench.polling.stop()
+    bench.answer()
     bench.answer()
     assert (bench.asked, bench.polling.next_at, bench.polling.health.state) == ([], None, None)
     bench.polling.heard(b"...")
