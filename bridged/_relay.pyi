@@ -74,8 +74,13 @@ class Relay:
         `capacity`, `critical`, `ready`: frames that its transmit buffer holds, and above and below which it
         says "stop" and "go". Until this is called no frame is sent; it ends when the port is detached.
         """
-    def command(self, token: int, data: bytes, accept: int, prefix: bytes, timeout: float) -> None:
-        """Send a command at the next message boundary; an event with `token` always follows."""
+    def command(
+        self, token: int, data: bytes, accept: int, prefix: bytes, timeout: float, *, more: bool = False
+    ) -> None:
+        """Send a command at the next message boundary; an event with `token` always follows.
+
+        `more`: together with the next command, which follows at once.
+        """
     def events(self) -> list[tuple[int, int, bytes]]:
         """What happened since the last call: (EVENT_…, token, text)."""
     def counters(self) -> dict[str, int | dict[str, int]]:

@@ -44,7 +44,8 @@ class Exchanges:
         """Whether a procedure is under way."""
         return self._steps is not None
 
-    def ask(self, exchange: Exchange, then: Callable[[Answer], None]) -> None:
+    def ask(self, exchange: Exchange, then: Callable[[Answer], None], more: bool = False) -> None:
+        """`more`: another follows at once, and they go together."""
         if exchange.opens:
             self._relay.set_gates(receiving=True, transmit=_relay.GATE_AWAY)
         token = next(self._tokens) & 0xFFFFFFFF
@@ -52,7 +53,7 @@ class Exchanges:
         replies = exchange.accept + exchange.reject
         accept = _relay.ACCEPT_OK if Reply.OK in replies else 0
         accept |= _relay.ACCEPT_REFUSED if Reply.REFUSED in replies else 0
-        self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s)
+        self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s, more=more)
 
     def run(self, steps: Steps, end: Event) -> None:
         """Performs them one after the other; a step that was under way is forgotten, its answer awaited."""

@@ -32,7 +32,7 @@ NOISE_CAUSES = "a damaged cable, a wrong baud rate, or another program at its po
 class HealthPolling:
     """All questions at once, and again `interval_s` after the last answer.
 
-    `ask` sends an exchange and calls back with its answer; `tell` puts an error frame on the bus; `failed`
+    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts an error frame on the bus; `failed`
     hears why the adapter must be initialised again, `bus_off` that it is bus-off, or gets rid of no frame for
     `stuck_s` and may be; `counters` are the relay's.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
@@ -43,7 +43,7 @@ class HealthPolling:
         adapter: Adapter,
         interval_s: float,
         *,
-        ask: Callable[[Exchange, Callable[[Answer], None]], None],
+        ask: Callable[[Exchange, Callable[[Answer], None], bool], None],
         tell: Callable[[bytes], None],
         failed: Callable[[str], None],
         bus_off: Callable[[str], None],
@@ -157,8 +157,9 @@ class HealthPolling:
         answers: list[Answer | None] = [None] * len(questions)
         self._answers = answers
         self._asked_at = time.monotonic()
+        last = len(questions) - 1
         for number, question in enumerate(questions):
-            self._ask(question, functools.partial(self._answered, answers, number))
+            self._ask(question, functools.partial(self._answered, answers, number), number < last)
 
     def _answered(self, answers: list[Answer | None], number: int, answer: Answer) -> None:
         if answers is not self._answers:

@@ -310,13 +310,15 @@ static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs
 
 static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
 {
-    static char *names[] = {"token", "data", "accept", "prefix", "timeout", NULL};
+    static char *names[] = {"token", "data", "accept", "prefix", "timeout", "more", NULL};
     struct command c;
     unsigned int token;
     Py_buffer data, prefix;
     int accept;
     double timeout;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*iy*d:command", names, &token, &data, &accept, &prefix, &timeout))
+    int more = 0;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*iy*d|$p:command", names, &token, &data, &accept, &prefix,
+                                     &timeout, &more))
         return NULL;
     int result = command_init(&c, &data, accept, &prefix);
     if (!result && !seconds_valid(timeout)) {
@@ -333,7 +335,7 @@ static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
     bool taken = r->port >= 0 && transmit_command(r, &c);
     if (!taken) /* no port, or more commands waiting than can ever be meant */
         relay_emit(r, EVENT_TIMEOUT, token, NULL, 0);
-    return relay_unlock_wake(r);
+    return more ? relay_unlock(r) : relay_unlock_wake(r);
 }
 
 static PyObject *event_object(const struct event *e)

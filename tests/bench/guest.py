@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import fleet
 import loss
 from subjects import HERE, SUBJECTS, Load, Ours, Subject
 
@@ -136,6 +137,7 @@ def idle(session: Session) -> None:
 
 
 FIGURES = {
+    "growth": fleet.measure,  # first: no other bridge is there
     "saturation": saturation,
     "full-bus": full_bus,
     "latency": latency,

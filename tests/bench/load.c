@@ -17,11 +17,11 @@
 #include <linux/can.h>
 #include <linux/can/raw.h>
 #include <net/if.h>
-#include <poll.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/prctl.h>
 #include <sys/socket.h>
 #include <termios.h>
@@ -37,8 +37,9 @@ enum { SAMPLES_MAX = 4000000 };
 static struct options set = {.outstanding = 128, .warm_up_s = 0.3, .seconds = 2, .drain_s = 2, .cpu = -1};
 static struct channel *channels;
 static size_t channel_count;
-static struct pollfd *fds;
+static int waiting; /* an epoll: what it costs to wait for many channels is the load's, but it delays frames */
 static uint64_t sent_total, received_total;
+static uint64_t bunched; /* frames that were late, and so went out at once with that before it */
 static int64_t measure_from, measure_until, progress_at;
 static uint32_t *samples; /* latencies in ns, of frames sent while it was measured */
 static size_t sample_count;
@@ -159,23 +160,47 @@ static int64_t send_due(int64_t now, int64_t start)
             channel_saturate(&channels[i], now);
         return now + STALL_NS;
     }
-    for (;;) {
+    for (int n = 0;; n++) {
         int64_t due = start + (int64_t)((double)sent_total / set.rate * NS_PER_S);
         if (due > now)
             return due;
         if (!frame_send(&channels[sent_total % channel_count], now_ns()))
             return now + NS_PER_S / 1000;
+        bunched += n > 0;
     }
+}
+
+/* `side`: 0 the port, 1 the bus. */
+static void watch(int operation, size_t channel, uint64_t side, uint32_t events)
+{
+    int fd = side ? channels[channel].bus : channels[channel].port;
+    struct epoll_event event = {.events = events, .data.u64 = 2 * channel + side};
+    if (fd >= 0 && epoll_ctl(waiting, operation, fd, &event) < 0)
+        fail("epoll_ctl");
 }
 
 static void wait_ready(int64_t now, int64_t until)
 {
-    for (size_t i = 0; i < channel_count; i++)
-        fds[2 * i].events = POLLIN | (channels[i].out_end ? POLLOUT : 0);
+    for (size_t i = 0; i < channel_count; i++) {
+        bool blocked = channels[i].out_end != 0;
+        if (blocked == channels[i].blocked)
+            continue;
+        channels[i].blocked = blocked;
+        watch(EPOLL_CTL_MOD, i, 0, EPOLLIN | (blocked ? EPOLLOUT : 0));
+    }
     int64_t left = until > now ? until - now : 0;
     struct timespec timeout = {left / NS_PER_S, left % NS_PER_S};
-    if (ppoll(fds, 2 * channel_count, &timeout, NULL) < 0 && errno != EINTR)
-        fail("ppoll");
+    static struct epoll_event events[2 * CHANNELS_MAX];
+    int n = epoll_pwait2(waiting, events, 2 * CHANNELS_MAX, &timeout, NULL);
+    if (n < 0 && errno != EINTR)
+        fail("epoll_pwait2");
+    for (int i = 0; i < n; i++) {
+        struct channel *ch = &channels[events[i].data.u64 / 2];
+        if (events[i].data.u64 % 2)
+            bus_receive(ch);
+        else if (events[i].events & ~(uint32_t)EPOLLOUT)
+            port_receive(ch);
+    }
 }
 
 /* One turn; sends only if told to. -> the time */
@@ -188,12 +213,6 @@ static int64_t turn(int64_t start, int64_t end, bool sending)
         if (channels[i].out_end)
             port_flush(&channels[i]);
     wait_ready(now, until < end ? until : end);
-    for (size_t i = 0; i < channel_count; i++) {
-        if (fds[2 * i].revents & ~POLLOUT)
-            port_receive(&channels[i]);
-        if (fds[2 * i + 1].revents)
-            bus_receive(&channels[i]);
-    }
     now = now_ns();
     if (received_total != before)
         progress_at = now;
@@ -236,9 +255,11 @@ static void report(const struct usage *a, const struct usage *b, double wall_s, 
     printf("{\"wall_s\": %.6f, \"frames\": %llu, \"sent\": %llu, \"received\": %llu, \"missing\": %llu,\n", wall_s,
            (unsigned long long)frames, (unsigned long long)sent_total, (unsigned long long)received_total,
            (unsigned long long)missing());
-    printf(" \"gaps\": %llu, \"misordered\": %llu, \"refusals\": %llu, \"commands\": %llu, \"own_lost\": %llu,\n",
+    printf(" \"gaps\": %llu, \"misordered\": %llu, \"refusals\": %llu, \"commands\": %llu, \"own_lost\": %llu,"
+           " \"bunched\": %llu,\n",
            (unsigned long long)sum.lost, (unsigned long long)sum.misordered, (unsigned long long)sum.refusals,
-           (unsigned long long)sum.commands, (unsigned long long)own_lost);
+           (unsigned long long)sum.commands, (unsigned long long)own_lost,
+           (unsigned long long)bunched);
     printf(" \"cpu_ns\": %llu, \"own_cpu_ns\": %llu, \"busy_ns\": %llu, \"switches\": %llu",
            (unsigned long long)(b->cpu_ns - a->cpu_ns), (unsigned long long)(b->own_cpu_ns - a->own_cpu_ns),
            (unsigned long long)(b->busy_ns - a->busy_ns), (unsigned long long)(b->switches - a->switches));
@@ -327,15 +348,15 @@ static void parse(int argc, char **argv)
     if (!channel_count || channel_count > CHANNELS_MAX || (argc - optind) % 2)
         fail("PORT BUS, up to 64 times, is wanted");
     channels = calloc(channel_count, sizeof *channels);
-    fds = calloc(2 * channel_count, sizeof *fds);
+    waiting = epoll_create1(EPOLL_CLOEXEC);
     samples = malloc(SAMPLES_MAX * sizeof *samples);
-    if (!channels || !fds || !samples)
+    if (!channels || !samples || waiting < 0)
         fail("memory");
     for (size_t i = 0; i < channel_count; i++) {
         channels[i] = (struct channel){
             .set = &set, .port = port_open(argv[optind + 2 * (int)i]), .bus = bus_open(argv[optind + 2 * (int)i + 1])};
-        fds[2 * i] = (struct pollfd){.fd = channels[i].port, .events = POLLIN};
-        fds[2 * i + 1] = (struct pollfd){.fd = channels[i].bus, .events = POLLIN};
+        watch(EPOLL_CTL_ADD, i, 0, EPOLLIN);
+        watch(EPOLL_CTL_ADD, i, 1, EPOLLIN);
     }
 }
 
@@ -358,8 +379,10 @@ int main(int argc, char **argv)
     int64_t now = start;
     while (now < measure_from)
         now = turn(start, measure_from, true);
+    int64_t stopped = now_ns();
     struct usage before = usage_now(&set);
     int64_t from = measure_from = now_ns();
+    start += from - stopped; /* what was due while the books were read does not come all at once */
     measure_until = from + (int64_t)(set.seconds * NS_PER_S);
     uint64_t received = received_total;
     while (now < measure_until)

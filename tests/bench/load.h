@@ -50,6 +50,7 @@ struct channel {
     size_t in_length;
     uint8_t out[OUT_SIZE];
     size_t out_start, out_end;
+    bool blocked;      /* the port did not take all that there was */
 };
 
 /* What a process, or several, used up to now. */

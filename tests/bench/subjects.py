@@ -75,12 +75,11 @@ class Load:
             raise RuntimeError(f"{subjects[0].name}: {done.stderr}\n{said}")
         return dict(json.loads(done.stdout))
 
-    def keep(self, subject: Subject) -> subprocess.Popen[bytes]:
-        """Answer the subject's questions until this is killed."""
-        command = self.command([subject], "--direction", "idle", "--seconds", 1_000_000)
-        return subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=subject.fds
-        )
+    def keep(self, subjects: Sequence[Subject]) -> subprocess.Popen[bytes]:
+        """Answer the subjects' questions until this is killed."""
+        command = self.command(subjects, "--direction", "idle", "--seconds", 1_000_000)
+        fds = [fd for subject in subjects for fd in subject.fds]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=fds)
 
 
 class Subject:
@@ -174,21 +173,28 @@ class Ours(Subject):
     _keeper: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
+        self.prepare()
+        self._keep()
+        self.launch()
+
+    def prepare(self) -> None:
+        """Its port and its configuration; before it is launched somebody must play the adapter."""
         self.protocol = self.adapter
         slave = self._make_pty()
         self._socket = self.directory / f"{self.name}.sock"
-        configuration = self.directory / f"{self.name}.yaml"
+        self._configuration = self.directory / f"{self.name}.yaml"
         baudrate = ", baudrate: 115200" if self.adapter == "can232" else ""
-        configuration.write_text(
+        self._configuration.write_text(
             f"adapter: {{type: {self.adapter}, port: {slave}{baudrate}}}\nchannel: {{bitrate: 1000000}}\n"
             f"bus: {{channel: {self.bus}}}\n{self.transmit}"
         )
-        self._keep()
-        self._spawn(*self._command(), "run", configuration, "--socket", self._socket)
+
+    def launch(self) -> None:
+        self._spawn(*self._command(), "run", self._configuration, "--socket", self._socket)
         wait_for(lambda: self.alive() and self.status().get("state") == "running", f"{self.name} to run")
 
     def _keep(self) -> None:
-        self._keeper = self.load.keep(self)
+        self._keeper = self.load.keep([self])
 
     def _unkeep(self) -> None:
         if self._keeper is not None:

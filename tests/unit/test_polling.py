@@ -42,7 +42,7 @@ class Bench:
         self.polling = HealthPolling(
             self.adapter,  # type: ignore[arg-type]
             0.25,
-            ask=lambda _exchange, then: self.asked.append(then),
+            ask=lambda _exchange, then, _more: self.asked.append(then),
             tell=self.told.append,
             failed=self.failed.append,
             bus_off=self.off.append,
