@@ -32,9 +32,9 @@ NOISE_CAUSES = "a damaged cable, a wrong baud rate, or another program at its po
 class HealthPolling:
     """All questions at once, and again `interval_s` after the last answer.
 
-    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts an error frame on the bus; `failed`
-    hears why the adapter must be initialised again, `bus_off` that it is bus-off, or gets rid of no frame for
-    `stuck_s` and may be; `counters` are the relay's.
+    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts an
+    error frame on the bus; `failed` hears why the adapter must be initialised again, `bus_off` that it is
+    bus-off, or gets rid of no frame for `stuck_s` and may be; `counters` are the relay's.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
