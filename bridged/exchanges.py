@@ -50,9 +50,10 @@ class Exchanges:
             self._relay.set_gates(receiving=True, transmit=_relay.GATE_AWAY)
         token = next(self._tokens) & 0xFFFFFFFF
         self._pending[token] = then
-        replies = exchange.accept + exchange.reject
-        accept = _relay.ACCEPT_OK if Reply.OK in replies else 0
-        accept |= _relay.ACCEPT_REFUSED if Reply.REFUSED in replies else 0
+        accepted, rejected = exchange.accept, exchange.reject
+        accept = _relay.ACCEPT_OK if Reply.OK in accepted or Reply.OK in rejected else 0
+        if Reply.REFUSED in accepted or Reply.REFUSED in rejected:
+            accept |= _relay.ACCEPT_REFUSED
         self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s, more=more)
 
     def run(self, steps: Steps, end: Event) -> None:

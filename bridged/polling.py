@@ -32,8 +32,8 @@ NOISE_CAUSES = "a damaged cable, a wrong baud rate, or another program at its po
 class HealthPolling:
     """All questions at once, and again `interval_s` after the last answer.
 
-    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts an
-    error frame on the bus; `failed` hears why the adapter must be initialised again, `bus_off` that it is
+    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts
+    an error frame on the bus; `failed` hears why the adapter must be initialised again, `bus_off` that it is
     bus-off, or gets rid of no frame for `stuck_s` and may be; `counters` are the relay's.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
@@ -68,6 +68,7 @@ class HealthPolling:
             deque()
         )  # time, frames to the bus, frames to the adapter
         self._answers: list[Answer | None] | None = None  # of the questions that are being asked
+        self._awaited = 0  # those still to come
         self._unknown = 0  # looks one after the other without an answer
         self.description = ""  # what the adapter said last
         self.full_at = -math.inf  # when it said last that its transmit buffer was full
@@ -156,6 +157,7 @@ class HealthPolling:
         questions = self._adapter.health_questions()
         answers: list[Answer | None] = [None] * len(questions)
         self._answers = answers
+        self._awaited = len(questions)
         self._asked_at = time.monotonic()
         last = len(questions) - 1
         for number, question in enumerate(questions):
@@ -165,6 +167,9 @@ class HealthPolling:
         if answers is not self._answers:
             return
         answers[number] = answer
+        self._awaited -= 1
+        if number and self._awaited:
+            return
         now = time.monotonic()
         if number == 0 and answer.reply is not Reply.NONE:
             self._answer_times_s.append(now - self._asked_at)

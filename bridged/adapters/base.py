@@ -105,9 +105,9 @@ class Adapter(Protocol):
         """To be asked at once, to know what the device thinks of its bus."""
 
     def read_health(self, answers: Sequence[Answer | None]) -> Observation | None:
-        """What it answered, in the order of the questions; None: it takes more of the answers to know.
+        """What it answered, in the order of the questions; None: it takes the other answers to know.
 
-        AdapterError: it must be initialised again.
+        Called with the first answer, and with all. AdapterError: it must be initialised again.
         """
 
     def saw_time_stamps(self) -> None:
