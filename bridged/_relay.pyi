@@ -83,6 +83,9 @@ class Relay:
         """
     def events(self) -> list[tuple[int, int, bytes]]:
         """What happened since the last call: (EVENT_…, token, text)."""
+    def tally(self) -> tuple[int, int, int, int, int]:
+        """Of the counters: decoded, rx_frames, tx_frames, rx_overruns, skipped_bytes; for frequent looks."""
+
     def counters(self) -> dict[str, int | dict[str, int]]:
         """A snapshot between two turns: bus_read = tx_frames + queued + the sum of tx_dropped."""
 

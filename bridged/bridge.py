@@ -111,7 +111,7 @@ class Bridge:
             failed=lambda reason: self._dispatch(Event.SILENT, reason),
             bus_off=self._on_bus_off,
             stuck_s=stuck_s(config),
-            counters=self._relay.counters,
+            tally=self._relay.tally,
         )
         self._thread = threading.Thread(target=self._relay.run, name="relay")
 

@@ -7,7 +7,7 @@ import logging
 import math
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bridged.adapters.base import Reply
 from bridged.errors import AdapterError
@@ -34,7 +34,7 @@ class HealthPolling:
 
     `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts
     an error frame on the bus; `failed` hears why the adapter must be initialised again, `bus_off` that it is
-    bus-off, or gets rid of no frame for `stuck_s` and may be; `counters` are the relay's.
+    bus-off, or gets rid of no frame for `stuck_s` and may be; `tally` is the relay's.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
@@ -48,7 +48,7 @@ class HealthPolling:
         failed: Callable[[str], None],
         bus_off: Callable[[str], None],
         stuck_s: float,
-        counters: Callable[[], dict[str, Any]],
+        tally: Callable[[], tuple[int, int, int, int, int]],
     ) -> None:
         self.health = Health()
         self.next_at: float | None = None
@@ -59,7 +59,7 @@ class HealthPolling:
         self._failed = failed
         self._bus_off = bus_off
         self._stall = Stall(stuck_s)
-        self._counters = counters
+        self._tally = tally
         self._overruns_seen = 0
         self._noise_seen = 0
         self._asked_at = 0.0
@@ -82,10 +82,8 @@ class HealthPolling:
         """The adapter runs; `restarted`: after bus-off."""
         if restarted:
             self._take(Observation("restarted", happened=Happened.RESTARTED))
-        counters = self._counters()
-        self._stall = Stall(self._stall.limit_s, counters["decoded"], counters["tx_frames"])
-        self._overruns_seen = counters["rx_overruns"]
-        self._noise_seen = counters["skipped_bytes"]
+        decoded, _, tx_frames, self._overruns_seen, self._noise_seen = self._tally()
+        self._stall = Stall(self._stall.limit_s, decoded, tx_frames)
         self._unknown = 0
         self.next_at = now
 
@@ -145,7 +143,7 @@ class HealthPolling:
 
     def heard_noise(self) -> bool:
         """Whether bytes without meaning came since the last look, and since this was asked last."""
-        return self._is_news(self._counters()["skipped_bytes"])
+        return self._is_news(self._tally()[-1])
 
     def _is_news(self, noise: int) -> bool:
         before, self._noise_seen = self._noise_seen, noise
@@ -195,15 +193,14 @@ class HealthPolling:
         if self._unknown == UNKNOWN_LIMIT:
             self._failed("the adapter does not answer questions about its bus")
             return
-        counters = self._counters()
-        self._sample(now, counters["rx_frames"], counters["tx_frames"])
-        if self._stall.observe(seen, now, counters["decoded"], counters["tx_frames"]):
+        decoded, rx_frames, tx_frames, overruns, skipped = self._tally()
+        self._sample(now, rx_frames, tx_frames)
+        if self._stall.observe(seen, now, decoded, tx_frames):
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
             self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
             return
-        if self._is_news(counters["skipped_bytes"]):
+        if self._is_news(skipped):
             self._warn(f"%s ({NOISE_CAUSES})", NOISE)
-        overruns = counters["rx_overruns"]
         if overruns != self._overruns_seen:
             self._overruns_seen = overruns
             text = "the adapter lost received frames"

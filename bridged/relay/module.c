@@ -383,6 +383,14 @@ static PyObject *Relay_counters(PyObject *self, PyObject *Py_UNUSED(ignored))
     return counters_dict(&count, queued, pending);
 }
 
+static PyObject *Relay_tally(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    const struct counters c = r->count;
+    relay_unlock(r);
+    return Py_BuildValue("(KKKKK)", c.decoded, c.delivered, c.confirmed, c.overruns, c.skipped_bytes);
+}
+
 static PyMethodDef RELAY_METHODS[] = {
     {"run", Relay_run, METH_NOARGS, NULL},
     {"turn", Relay_turn, METH_O, NULL},
@@ -400,6 +408,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"command", (PyCFunction)(void (*)(void))Relay_command, METH_VARARGS | METH_KEYWORDS, NULL},
     {"events", Relay_events, METH_NOARGS, NULL},
     {"counters", Relay_counters, METH_NOARGS, NULL},
+    {"tally", Relay_tally, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -113,7 +113,7 @@ def assert_survives(rig: Rig, device: Can232 | Usb2can, fault: Fault, cause: str
 CAN232 = {
     Fault("silence", 0, 4): SILENT,
     Fault("drop", 0, 4): SILENT,
-    Fault("poweroff", 0, 4): NO_POWER,
+    Fault("poweroff", 0, 4): f"{SILENT}|{NO_POWER}",  # the second if it is tried before the power is back
     Fault("reset", 0): CLOSED,
     Fault("garbage", 0, 10): NOISE,
     Fault("refuse", 0, 4): REFUSES,

@@ -37,8 +37,8 @@ class Bench:
         self.told: list[bytes] = []
         self.failed: list[str] = []
         self.off: list[str] = []
-        self.counters = {"rx_overruns": 0, "rx_frames": 0, "tx_frames": 0, "decoded": 0}
-        self.counters["skipped_bytes"] = 0
+        names = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
+        self.counters = dict.fromkeys(names, 0)
         self.polling = HealthPolling(
             self.adapter,  # type: ignore[arg-type]
             0.25,
@@ -47,7 +47,7 @@ class Bench:
             failed=self.failed.append,
             bus_off=self.off.append,
             stuck_s=0.0,
-            counters=lambda: self.counters,
+            tally=lambda: (*self.counters.values(),),
         )
         self.polling.start(0.0)
         self.polling.on_timer(0.0)

@@ -85,6 +85,8 @@ class Rig:
         assert isinstance(rx, dict)
         assert c["bus_read"] == c["tx_frames"] + c["queued"] + sum(tx.values())
         assert c["decoded"] == c["rx_frames"] + c["rx_pending"] + sum(rx.values())
+        looked_at = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
+        assert self.relay.tally() == tuple(c[name] for name in looked_at)
         return {**c, **tx, **{f"rx {k}": v for k, v in rx.items()}}  # type: ignore[dict-item]
 
     def events(self) -> list[tuple[int, int, bytes]]:
