@@ -11,7 +11,6 @@ import errno
 import logging
 import os
 import queue
-import random
 import re
 import threading
 import time
@@ -27,7 +26,7 @@ from bridged.buses import open_bus
 from bridged.errors import PortError
 from bridged.exchanges import REPLIES, Exchanges
 from bridged.health import BusState
-from bridged.lifecycle import Action, Backoff, Event, State, Told, repeated, transition
+from bridged.lifecycle import Action, Backoff, Event, State, Told, chance, repeated, transition
 from bridged.polling import NOISE, NOISE_CAUSES, HealthPolling
 from bridged.ports import open_port
 from bridged.ports.watch import Watch
@@ -77,7 +76,7 @@ class Bridge:
         self._port: Port | None = None
         self._timer: float | None = None
         reconnect = config.reconnect
-        self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, random.random)
+        self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, chance)
         # A CAN232's own serial number is not that of a USB device.
         usb = config.adapter.type == "usb2can"
         self._watch = Watch(config.adapter.port, config.adapter.serial_number if usb else None)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-import random
 import time
 from typing import TYPE_CHECKING
 
-from bridged.lifecycle import Backoff, Event, Told, repeated
+from bridged.lifecycle import Backoff, Event, Told, chance, repeated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +46,7 @@ class BusOff:
         self._restarting = False
         # An adapter that refuses every frame though its buffer is not full: a new start may help, but it may
         # also be that it does not know such frames.
-        self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, random.random)
+        self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, chance)
         self._refusing_until = 0.0
         self._discarded = 0  # of the adapter's, those told
         self._told = Told()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import os
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -142,6 +143,11 @@ def transition(state: State, event: Event) -> Transition:
     if (state, event) in IGNORED:
         return state, ()
     return TABLE[state, event]
+
+
+def chance() -> float:
+    """From 0 to below 1. (The module random is 3 % of the time that the bridge takes to start.)"""
+    return int.from_bytes(os.urandom(4)) / 2**32
 
 
 class Backoff:
