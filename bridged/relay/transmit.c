@@ -408,11 +408,12 @@ static void out_flush(struct relay *r)
     r->out_until_ns = NEVER;
 }
 
-/* Nothing waits, nothing is in flight: transmit_pump and transmit_deadline have nothing to look at. */
+/* Nothing waits, nothing is in flight, nothing is in the device's buffer: transmit_pump and transmit_deadline have nothing to look at. */
 bool transmit_idle(const struct relay *r)
 {
     bool owed = r->queue_count || r->retry_count || r->command_count || r->inflight_count || r->out_end;
-    return !owed && !r->poll.length && !r->flow.ask.length && !r->doubtful && !r->checking && !r->resyncing;
+    bool taken = r->flow.sent_count || r->flow.level;
+    return !owed && !taken && !r->poll.length && !r->doubtful && !r->checking && !r->resyncing;
 }
 
 /* Sends what the window allows, in one write. */
