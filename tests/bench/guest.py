@@ -19,7 +19,7 @@ from typing import Any
 
 import fleet
 import loss
-from subjects import HERE, SUBJECTS, Load, Ours, Subject
+from subjects import HERE, SUBJECTS, Load, Ours, Subject, words_of
 
 RATES = (100, 1000, 4000, 8000)
 FULL_BUS = 8000  # frames a second of 1 Mbit/s
@@ -58,23 +58,30 @@ class Session:
             for subject in subjects:
                 yield repetition, subject
 
-    def sample(self, figure: str, subject: Subject, repetition: int, **options: Any) -> dict[str, Any]:
-        """Take one; options of load.c, `warm_up=1` for --warm-up 1."""
+    def sample(self, figure: str, subject: Subject, repetition: int, **options: Any) -> None:
+        """Take one; options of load.c."""
         before = subject.dropped() if isinstance(subject, Ours) else 0
-        result = self.load.run([subject], *loss.words_of(options))
-        result |= {"figure": figure, "subject": subject.name, "repetition": repetition, **options}
+        result = self.load.run([subject], *words_of(options))
         if isinstance(subject, Ours):
             result["told"] = subject.dropped() - before
             result["unaccounted"] = subject.unaccounted()
-        self.samples.append(result)
+        self.add(figure, subject.name, repetition, options, result)
+
+    def add(
+        self, figure: str, subject: str, repetition: int, options: dict[str, Any], result: dict[str, Any]
+    ) -> None:
+        """One more."""
+        self.samples.append(
+            result | {"figure": figure, "subject": subject, "repetition": repetition, **options}
+        )
         us = result["cpu_ns"] / 1e3 / max(1, result["frames"])
         latency = result.get("latency_us", {})
         print(
-            f"{figure} {subject.name} {options}: {result['frames'] / result['wall_s']:.0f}/s {us:.1f} µs"
-            f" missing={result['missing']} p50={latency.get('p50')} p99={latency.get('p99')}",
+            f"{figure} {subject} {options}: {result['frames'] / result['wall_s']:.0f}/s {us:.1f} µs"
+            f" missing={result['missing']} bunched={result['bunched']}"
+            f" p50={latency.get('p50')} p99={latency.get('p99')}",
             flush=True,
         )
-        return result
 
     def close(self) -> None:
         for subject in self._started.values():
@@ -84,7 +91,7 @@ class Session:
 
 def saturation(session: Session) -> None:
     """CPU per frame as fast as it goes, both ways."""
-    repetitions, seconds = (1, 0.1) if session.quick else (3, 0.2)
+    repetitions, seconds, python_s = (1, 0.05, 0.1) if session.quick else (3, 0.2, 0.3)
     c_subjects = ["floor", "can-bridge", "slcanpty", "kernel-slcan", "can-bridge-usb2can"]
     wide = ["floor-wide", "can-bridge-wide"]
     for direction, names in (("to-bus", c_subjects), ("to-device", c_subjects + wide)):
@@ -92,15 +99,18 @@ def saturation(session: Session) -> None:
             session.sample(
                 "saturation", subject, repetition, direction=direction, seconds=seconds, warm_up=0.05, drain=1
             )
-        for repetition, subject in session.rounds(1 if session.quick else 3, ["python-can"]):
+        # In quick mode at most so many on their way: what the port has room for takes it most of a second.
+        bound = {"outstanding": 128} if session.quick else {}
+        for repetition, subject in session.rounds(repetitions, ["python-can"]):
             session.sample(
-                "saturation", subject, repetition, direction=direction, seconds=0.3, warm_up=0.1, drain=2
-            )
+                "saturation", subject, repetition,
+                direction=direction, seconds=python_s, warm_up=0.1, drain=2, **bound,
+            )  # fmt: skip
 
 
 def full_bus(session: Session) -> None:
     """What 8,000 frames a second take, as they come from a full bus."""
-    repetitions, seconds = (1, 0.2) if session.quick else (3, 0.4)
+    repetitions, seconds = (1, 0.1) if session.quick else (3, 0.4)
     names = ["floor", "can-bridge", "can-bridge-usb2can", "slcanpty", "kernel-slcan"]
     for repetition, subject in session.rounds(repetitions, names):
         session.sample(
@@ -117,13 +127,13 @@ def full_bus(session: Session) -> None:
 
 def latency(session: Session) -> None:
     """One way, added. Back with a wide window: with that of 1 the line's round trip decides."""
-    frames = 200 if session.quick else 4000
+    frames, least_s = (100, 0.05) if session.quick else (4000, 0.25)
     for rate in (RATES[0], RATES[-1]) if session.quick else RATES:
         for direction, ours in (("to-bus", "can-bridge"), ("to-device", "can-bridge-wide")):
             for repetition, subject in session.rounds(1, [ours, "slcanpty"]):
                 session.sample(
                     "latency", subject, repetition, direction=direction, rate=rate,
-                    seconds=max(0.25, frames / rate), warm_up=0.1, drain=1,
+                    seconds=max(least_s, frames / rate), warm_up=0.1, drain=1,
                 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""On this machine, at its own speed, without CAN: the floor, many bridges. host.py FILE [--quick] [FIGURE…]
+"""On this machine, at its own speed, without CAN: the floor. host.py FILE [--quick]
 
 The bus is a socketpair, the port a pseudo terminal.
 """
@@ -15,9 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from subjects import HERE, SUBJECTS, Load, Ours, Subject
-
-FLEETS = (1, 4, 16, 64)
-FLEET_LOAD = 8000  # frames a second over all of a fleet
 
 
 def shown(sample: dict[str, Any]) -> str:
@@ -63,42 +60,17 @@ def floor(load: Load, directory: Path, quick: bool) -> Iterator[dict[str, Any]]:
                     }  # fmt: skip
 
 
-def growth(load: Load, directory: Path, quick: bool) -> Iterator[dict[str, Any]]:
-    """1, 4, 16, 64 bridges share a load, and the same with none: health polls are theirs alone."""
-    repetitions, seconds = (1, 1.0) if quick else (5, 4.0)
-    fleets = FLEETS[:2] if quick else FLEETS
-    with started(load, directory, *["can-bridge"] * fleets[-1]) as bridges:
-        for repetition in range(repetitions):
-            for size in fleets:
-                for rate in (FLEET_LOAD, 0):
-                    direction = "to-bus" if rate else "idle"
-                    options = ("--direction", direction, "--rate", rate, "--seconds", seconds, "--drain", 5)
-                    sample = load.run(bridges[:size], *options)
-                    yield sample | {
-                        "figure": "growth", "subject": f"can-bridge x {size}", "size": size,
-                        "direction": direction, "rate": rate, "repetition": repetition,
-                    }  # fmt: skip
-        for bridge in bridges:
-            if isinstance(bridge, Ours) and bridge.unaccounted():
-                raise RuntimeError(f"the counters do not add up: {bridge.settled_counters()}")
-
-
-FIGURES = {"floor": floor, "growth": growth}
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
-    parser.add_argument("figures", nargs="*", choices=[[], *FIGURES], default=[])
     parser.add_argument("--quick", action="store_true")
-    args = parser.parse_intermixed_args()
+    args = parser.parse_args()
     load = Load(HERE / "build" / "load")
     samples = []
     with tempfile.TemporaryDirectory() as name:
-        for figure in args.figures or FIGURES:
-            for sample in FIGURES[figure](load, Path(name), args.quick):
-                samples.append(sample)
-                print(shown(sample), flush=True)
+        for sample in floor(load, Path(name), args.quick):
+            samples.append(sample)
+            print(shown(sample), flush=True)
     args.file.write_text(json.dumps(samples, indent=1))
     return 0
 

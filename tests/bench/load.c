@@ -17,6 +17,7 @@
 #include <linux/can.h>
 #include <linux/can/raw.h>
 #include <net/if.h>
+#include <poll.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -34,10 +35,11 @@
 #define SEQUENCE_MASK ((UINT32_C(1) << SEQUENCE_BITS) - 1)
 enum { SAMPLES_MAX = 4000000 };
 
-static struct options set = {.outstanding = 128, .warm_up_s = 0.3, .seconds = 2, .drain_s = 2, .cpu = -1};
+static struct options set = {.warm_up_s = 0.3, .seconds = 2, .drain_s = 2, .cpu = -1};
 static struct channel *channels;
 static size_t channel_count;
-static int waiting; /* an epoll: what it costs to wait for many channels is the load's, but it delays frames */
+static struct pollfd *fds; /* of channel n: 2n its port, 2n + 1 its bus */
+static int epoll = -1;     /* instead */
 static uint64_t sent_total, received_total;
 static uint64_t bunched; /* frames that were late, and so went out at once with that before it */
 static int64_t measure_from, measure_until, progress_at;
@@ -113,18 +115,13 @@ static bool frame_send(struct channel *ch, int64_t now)
     return true;
 }
 
-/* As fast as accepted: a few kilobytes ready for the port, a bounded number of frames on their way to it. */
+/* As fast as accepted: a few kilobytes ready for the port, a bounded number of frames on their way. */
 static void channel_saturate(struct channel *ch, int64_t now)
 {
-    if (set.direction == TO_BUS) {
-        while (ch->out_end < OUT_LEVEL && frame_send(ch, now))
-            ;
-        return;
-    }
     if (now - progress_at > STALL_NS)
         ch->answered = ch->sent;
     uint64_t done = ch->received > ch->answered ? ch->received : ch->answered;
-    while (ch->sent < done + set.outstanding && frame_send(ch, now_ns()))
+    while (ch->sent < done + set.outstanding && ch->out_end < OUT_LEVEL && frame_send(ch, now_ns()))
         ;
 }
 
@@ -150,7 +147,8 @@ static void bus_receive(struct channel *ch)
 
 /* --- the loop -------------------------------------------------------------------------------- */
 
-/* Sends what is due up to now, round robin; -> when the next one is. */
+/* Sends what is due up to now, round robin, but no more than a batch: who is late must see the end all the same.
+ * -> when the next one is due */
 static int64_t send_due(int64_t now, int64_t start)
 {
     if (set.direction == IDLE)
@@ -160,7 +158,7 @@ static int64_t send_due(int64_t now, int64_t start)
             channel_saturate(&channels[i], now);
         return now + STALL_NS;
     }
-    for (int n = 0;; n++) {
+    for (int n = 0; n < BATCH; n++) {
         int64_t due = start + (int64_t)((double)sent_total / set.rate * NS_PER_S);
         if (due > now)
             return due;
@@ -168,39 +166,63 @@ static int64_t send_due(int64_t now, int64_t start)
             return now + NS_PER_S / 1000;
         bunched += n > 0;
     }
+    return now;
 }
 
-/* `side`: 0 the port, 1 the bus. */
-static void watch(int operation, size_t channel, uint64_t side, uint32_t events)
+static void channel_ready(size_t n, uint32_t events)
 {
-    int fd = side ? channels[channel].bus : channels[channel].port;
-    struct epoll_event event = {.events = events, .data.u64 = 2 * channel + side};
-    if (fd >= 0 && epoll_ctl(waiting, operation, fd, &event) < 0)
+    struct channel *ch = &channels[n / 2];
+    if (n % 2)
+        bus_receive(ch);
+    else if (events & ~(uint32_t)POLLOUT)
+        port_receive(ch);
+}
+
+static void epoll_change(int operation, size_t n)
+{
+    struct epoll_event event = {.events = (uint32_t)fds[n].events, .data.u64 = n};
+    if (fds[n].fd >= 0 && epoll_ctl(epoll, operation, fds[n].fd, &event) < 0)
         fail("epoll_ctl");
 }
 
-static void wait_ready(int64_t now, int64_t until)
+/* POLLIN and the others are EPOLLIN and so on. */
+static void epoll_turn(const struct timespec *timeout)
+{
+    static struct epoll_event events[2 * CHANNELS_MAX];
+    int n = epoll_pwait2(epoll, events, 2 * CHANNELS_MAX, timeout, NULL);
+    if (n < 0 && errno != EINTR)
+        fail("epoll_pwait2");
+    for (int i = 0; i < n; i++)
+        channel_ready(events[i].data.u64, events[i].events);
+}
+
+static void poll_turn(const struct timespec *timeout)
+{
+    int n = ppoll(fds, 2 * channel_count, timeout, NULL);
+    if (n < 0 && errno != EINTR)
+        fail("ppoll");
+    for (size_t i = 0; n > 0 && i < 2 * channel_count; i++)
+        if (fds[i].revents)
+            channel_ready(i, (uint32_t)fds[i].revents);
+}
+
+/* Waits until then for whatever comes, and takes it. */
+static void wait_and_take(int64_t now, int64_t until)
 {
     for (size_t i = 0; i < channel_count; i++) {
-        bool blocked = channels[i].out_end != 0;
-        if (blocked == channels[i].blocked)
+        short events = POLLIN | (channels[i].out_end ? POLLOUT : 0);
+        if (events == fds[2 * i].events)
             continue;
-        channels[i].blocked = blocked;
-        watch(EPOLL_CTL_MOD, i, 0, EPOLLIN | (blocked ? EPOLLOUT : 0));
+        fds[2 * i].events = events;
+        if (epoll >= 0)
+            epoll_change(EPOLL_CTL_MOD, 2 * i);
     }
     int64_t left = until > now ? until - now : 0;
     struct timespec timeout = {left / NS_PER_S, left % NS_PER_S};
-    static struct epoll_event events[2 * CHANNELS_MAX];
-    int n = epoll_pwait2(waiting, events, 2 * CHANNELS_MAX, &timeout, NULL);
-    if (n < 0 && errno != EINTR)
-        fail("epoll_pwait2");
-    for (int i = 0; i < n; i++) {
-        struct channel *ch = &channels[events[i].data.u64 / 2];
-        if (events[i].data.u64 % 2)
-            bus_receive(ch);
-        else if (events[i].events & ~(uint32_t)EPOLLOUT)
-            port_receive(ch);
-    }
+    if (epoll >= 0)
+        epoll_turn(&timeout);
+    else
+        poll_turn(&timeout);
 }
 
 /* One turn; sends only if told to. -> the time */
@@ -212,7 +234,7 @@ static int64_t turn(int64_t start, int64_t end, bool sending)
     for (size_t i = 0; i < channel_count; i++)
         if (channels[i].out_end)
             port_flush(&channels[i]);
-    wait_ready(now, until < end ? until : end);
+    wait_and_take(now, until < end ? until : end);
     now = now_ns();
     if (received_total != before)
         progress_at = now;
@@ -255,11 +277,10 @@ static void report(const struct usage *a, const struct usage *b, double wall_s, 
     printf("{\"wall_s\": %.6f, \"frames\": %llu, \"sent\": %llu, \"received\": %llu, \"missing\": %llu,\n", wall_s,
            (unsigned long long)frames, (unsigned long long)sent_total, (unsigned long long)received_total,
            (unsigned long long)missing());
-    printf(" \"gaps\": %llu, \"misordered\": %llu, \"refusals\": %llu, \"commands\": %llu, \"own_lost\": %llu,"
-           " \"bunched\": %llu,\n",
+    printf(" \"gaps\": %llu, \"misordered\": %llu, \"refusals\": %llu, \"commands\": %llu, \"own_lost\": %llu,\n",
            (unsigned long long)sum.lost, (unsigned long long)sum.misordered, (unsigned long long)sum.refusals,
-           (unsigned long long)sum.commands, (unsigned long long)own_lost,
-           (unsigned long long)bunched);
+           (unsigned long long)sum.commands, (unsigned long long)own_lost);
+    printf(" \"bunched\": %llu,\n", (unsigned long long)bunched);
     printf(" \"cpu_ns\": %llu, \"own_cpu_ns\": %llu, \"busy_ns\": %llu, \"switches\": %llu",
            (unsigned long long)(b->cpu_ns - a->cpu_ns), (unsigned long long)(b->own_cpu_ns - a->own_cpu_ns),
            (unsigned long long)(b->busy_ns - a->busy_ns), (unsigned long long)(b->switches - a->switches));
@@ -322,7 +343,7 @@ static void parse(int argc, char **argv)
     static const struct option OPTIONS[] = {
         {"direction", 1, 0, 'd'}, {"protocol", 1, 0, 'p'}, {"rate", 1, 0, 'r'},   {"seconds", 1, 0, 's'},
         {"warm-up", 1, 0, 'w'},   {"drain", 1, 0, 'D'},    {"watch", 1, 0, 'W'},  {"outstanding", 1, 0, 'o'},
-        {"cpu", 1, 0, 'c'},      {"opaque", 0, 0, 'O'},
+        {"cpu", 1, 0, 'c'},      {"opaque", 0, 0, 'O'},    {"epoll", 0, 0, 'e'},
         {0},
     };
     for (int option; (option = getopt_long(argc, argv, "", OPTIONS, NULL)) != -1;) {
@@ -336,6 +357,7 @@ static void parse(int argc, char **argv)
         case 'o': set.outstanding = (uint32_t)atoi(optarg); break;
         case 'c': set.cpu = atoi(optarg); break;
         case 'O': set.opaque = true; break;
+        case 'e': set.epoll = true; break;
         case 'W':
             if (set.watched_count == WATCH_MAX)
                 fail("too many processes to watch");
@@ -344,20 +366,27 @@ static void parse(int argc, char **argv)
         default: exit(2);
         }
     }
+    if (!set.outstanding) /* a port takes as many as it has room for */
+        set.outstanding = set.direction == TO_BUS ? UINT32_MAX : 128;
     channel_count = (size_t)(argc - optind) / 2;
     if (!channel_count || channel_count > CHANNELS_MAX || (argc - optind) % 2)
         fail("PORT BUS, up to 64 times, is wanted");
     channels = calloc(channel_count, sizeof *channels);
-    waiting = epoll_create1(EPOLL_CLOEXEC);
+    fds = calloc(2 * channel_count, sizeof *fds);
     samples = malloc(SAMPLES_MAX * sizeof *samples);
-    if (!channels || !samples || waiting < 0)
+    if (!channels || !fds || !samples)
         fail("memory");
     for (size_t i = 0; i < channel_count; i++) {
         channels[i] = (struct channel){
             .set = &set, .port = port_open(argv[optind + 2 * (int)i]), .bus = bus_open(argv[optind + 2 * (int)i + 1])};
-        watch(EPOLL_CTL_ADD, i, 0, EPOLLIN);
-        watch(EPOLL_CTL_ADD, i, 1, EPOLLIN);
+        fds[2 * i] = (struct pollfd){.fd = channels[i].port, .events = POLLIN};
+        fds[2 * i + 1] = (struct pollfd){.fd = channels[i].bus, .events = POLLIN};
     }
+    if (!set.epoll)
+        return;
+    epoll = epoll_create1(EPOLL_CLOEXEC);
+    for (size_t n = 0; n < 2 * channel_count; n++)
+        epoll_change(EPOLL_CTL_ADD, n);
 }
 
 int main(int argc, char **argv)

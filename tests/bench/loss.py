@@ -11,11 +11,10 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from subjects import HERE, Ours, PythonCan, Subject, receivers, run, wait_for
+from subjects import HERE, Ours, PythonCan, Subject, receivers, run, wait_for, words_of
 
 sys.path.insert(0, str(HERE.parent / "system"))
 from rig import HOST, Chip, HostProcess
@@ -34,8 +33,9 @@ class Adapter:
 
     def __init__(self, name: str) -> None:
         self._state = HOST / f"loss-{name}.state"
+        # Not --precise: it would spin, and take from the virtual machine the processor that it needs.
         arguments = [
-            "simulate", "can232", "--line", "unix:../ftdi0.sock", "--uart-rate", BAUD, "--precise",
+            "simulate", "can232", "--line", "unix:../ftdi0.sock", "--uart-rate", BAUD,
             "--traffic", TRAFFIC, "--state", self._state.name,
         ]  # fmt: skip
         self._process = HostProcess([str(argument) for argument in arguments], f"loss-{name}")
@@ -148,9 +148,3 @@ def measure(session: Session) -> None:
                "adapter_characters_lost", "adapter_refused", "confirmed", "books")}, flush=True)  # fmt: skip
         subject.stop()
         adapter.stop()
-
-
-def words_of(options: dict[str, Any]) -> Iterator[object]:
-    for key, value in options.items():
-        yield f"--{key.replace('_', '-')}"
-        yield value

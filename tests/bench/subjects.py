@@ -43,6 +43,13 @@ def wait_for(condition: Callable[[], Any], what: str) -> None:
         time.sleep(0.05)
 
 
+def words_of(options: dict[str, Any]) -> Iterator[object]:
+    """Options of load.c: `warm_up=1` for --warm-up 1."""
+    for key, value in options.items():
+        yield f"--{key.replace('_', '-')}"
+        yield value
+
+
 def receivers(interface: str) -> int:
     """How many filters of sockets there are on the interface."""
     lists = Path("/proc/net/can").glob("rcvlist_*")
