@@ -373,11 +373,14 @@ class Bridge:
             log.info("adapter version=%s serial_number=%s", identity.version, identity.serial_number)
 
     def _close_channel(self) -> None:
+        bus_state = self._polling.health.state
         self._polling.stop()
         stopping = self.state is State.STOPPING
+        # What an error-passive one has taken may be there for long.
+        drain = stopping and bus_state is not None and bus_state < BusState.ERROR_PASSIVE
         gate = _relay.GATE_STOPPED if stopping else _relay.GATE_AWAY
         self._relay.set_gates(receiving=not self._exchanges.running, transmit=gate)
-        self._exchanges.run(self.adapter.close_steps(), Event.CLOSED)
+        self._exchanges.run(self.adapter.close_steps(drain), Event.CLOSED)
 
     def _release(self) -> None:
         self._bus_off.closed()

@@ -98,8 +98,11 @@ class Adapter(Protocol):
         `serial_number` is that of the USB device which is the port, None if it has none.
         """
 
-    def close_steps(self) -> Steps:
-        """From whatever state to a closed channel; the steps accept every answer."""
+    def close_steps(self, drain: bool) -> Steps:
+        """From whatever state to a closed channel; the steps accept every answer.
+
+        `drain`: what it has taken goes first; without it that is thrown away, since it may be too old.
+        """
 
     def health_questions(self) -> tuple[Exchange, ...]:
         """To be asked at once, to know what the device thinks of its bus."""

@@ -120,15 +120,16 @@ class Can232:
             log.info("firmware without auto poll: asking for frames with A every %g s", POLL_INTERVAL_S)
             self.polling = Polling(b"A\r", b"A", POLL_INTERVAL_S)
 
-    def close_steps(self) -> Steps:
+    def close_steps(self, drain: bool) -> Steps:
         """`C` until it is certain: the first may end a half command or meet an old answer.
 
-        C throws away what is in the transmit FIFO, and those frames are answered: so it comes once they are
-        on the bus, if others take up no more than half of it.
+        C throws away what is in the transmit FIFO, and those frames are answered: to drain it is to wait
+        until they are on the bus, if others take up no more than half of it.
         """
-        answer = yield self._flags_step  # it comes after those of all frames
-        if answer.reply is TEXT:
-            yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
+        if drain:
+            answer = yield self.sync  # answered after all frames
+            if answer.reply is TEXT:
+                yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
         yield from self._close()
         answer = yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
         if answer.reply is NONE:

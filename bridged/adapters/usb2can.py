@@ -132,10 +132,10 @@ class Usb2can:
             ask, prefix = message(READ_REG, MOD), bytes((READ_REG, 2, MOD))
         self.flow = Flow(ask, prefix, CAPACITY, self._critical, self._ready)
 
-    def close_steps(self) -> Steps:
-        """CONFIG_MODE and reset mode (chapter III), once what it has taken is on the bus or would not go."""
+    def close_steps(self, drain: bool) -> Steps:
+        """CONFIG_MODE and reset mode (chapter III); to drain is to wait for what goes on the bus at all."""
         if self.flow and self._levels_prefix:
-            yield from self._drain()
+            yield from self._drain(DRAIN_LOOKS_MAX if drain else 1)
         self.flow = None
         for _ in range(2):
             answer = yield self._in_config_mode(message(CONFIG_MODE))
@@ -148,10 +148,12 @@ class Usb2can:
             optional=True,
         )
 
-    def _drain(self) -> Steps:
-        """Waits while frames leave its transmit buffer."""
+    def _drain(self, looks_max: int) -> Steps:
+        """Waits while frames leave its transmit buffer, and counts those that stay."""
         fewest, looks = 255, DRAIN_LOOKS
-        for _ in range(DRAIN_LOOKS_MAX):
+        for look in range(looks_max):
+            if look:
+                yield pause(DRAIN_INTERVAL_S)
             levels = yield from self._read_levels()
             if levels is None or not levels.waiting:
                 return
@@ -159,7 +161,6 @@ class Usb2can:
             fewest = min(fewest, levels.waiting)
             if not looks:
                 break
-            yield pause(DRAIN_INTERVAL_S)
         self.discarded += fewest
 
     def _in_config_mode(self, request: bytes) -> Exchange:

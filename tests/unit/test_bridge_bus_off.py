@@ -11,6 +11,7 @@ from test_bridge import FRAME, Bench, run_until, started, stopped
 from test_bridge_usb2can import Usb2canBench
 
 from bridged import bridge as bridge_module
+from bridged.adapters.base import Steps
 from bridged.bridge import Bridge
 from bridged.health import CAN_ERR_RESTARTED, BusState, error_frame
 from bridged.lifecycle import Event, State
@@ -177,3 +178,46 @@ def test_frames_go_on_while_settings_change(can232: Bench) -> None:
     other.close()
     stopped(bridge)
     assert [frame.can_id for frame in can232.frames] == [1] * 4 + [2] * 4 + [3] * 4
+
+
+class Closings:
+    """Whether each closing of the channel is to wait for what the adapter has taken."""
+
+    def __init__(self, bridge: Bridge, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.drains: list[bool] = []
+        self._steps = bridge.adapter.close_steps
+        monkeypatch.setattr(bridge.adapter, "close_steps", self._close_steps)
+
+    def _close_steps(self, drain: bool) -> Steps:
+        self.drains.append(drain)
+        return self._steps(drain)
+
+
+def test_only_a_stop_waits_for_what_the_adapter_has_taken(
+    can232: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Anything else closes the channel to throw it away: the bus may be well again in that moment."""
+    can232.plug_in(Can232(time.monotonic()))
+    bridge = started(can232.bridge(transmit=TRANSMIT))
+    assert next(bridge.adapter.close_steps(drain=False)).request == b"C\r"
+    closings = Closings(bridge, monkeypatch)
+    can232.device.set_bus_off(time.monotonic(), True)
+    send(can232, OLD, 3)
+    run_until(bridge, lambda: bridge.state is not State.RUNNING)
+    can232.device.set_bus_off(time.monotonic(), False)
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-active")
+    stopped(bridge)
+    assert closings.drains == [False, True]
+
+
+def test_a_stop_does_not_wait_for_an_error_passive_adapter(
+    can232: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    can232.plug_in(Can232(time.monotonic()))
+    bridge = started(can232.bridge())
+    closings = Closings(bridge, monkeypatch)
+    can232.device.set_error_counters(time.monotonic(), 130, 3)
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-passive")
+    stopped(bridge)
+    assert closings.drains == [False]

@@ -275,7 +275,7 @@ def test_a_device_that_dies_while_it_is_closed_is_not_asked_for_mode_normal() ->
         rig.send(numbered(1))
         rig.relay.set_gates(receiving=True, transmit=_relay.GATE_STOPPED)
         begin = rig.now
-        rig.perform(rig.adapter.close_steps())
+        rig.perform(rig.adapter.close_steps(drain=True))
         assert rig.now - begin < 1.6 * S
         c = rig.counters()
         assert (c["resyncs"], c["unanswered"], c["queued"]) == (0, 1, 0)

@@ -60,7 +60,7 @@ class Host:
         self.perform(self.adapter.init_steps("A6008isP"), steps_wanted)
 
     def close(self) -> None:
-        self.perform(self.adapter.close_steps())
+        self.perform(self.adapter.close_steps(drain=True))
 
     def perform(self, steps: Steps, wanted: int = 1000) -> None:
         """AdapterError for an answer that is not accepted, too; `wanted` steps, no more."""
