@@ -167,9 +167,9 @@ def loss(samples: Sequence[Sample]) -> Iterator[Row]:
                   note="characters without a buffer, commands refused")  # fmt: skip
 
 
-# Of all threads for each question: a timer, the relay sends, it reads, Python looks at the answer. On a
-# USB2CAN five questions follow each other, and the answer to one is the timer of the next.
-POLL_WAKEUPS = {"can-bridge": 4.0, "can-bridge-usb2can": 2.25}
+# Of all threads for each question: a timer, the relay sends, it reads, Python looks at the answer. A
+# USB2CAN is asked five questions at once.
+POLL_WAKEUPS = {"can-bridge": 4.0, "can-bridge-usb2can": 4.0 / 5}
 
 
 def idle(samples: Sequence[Sample]) -> Iterator[Row]:
@@ -225,9 +225,11 @@ def codec(samples: Sequence[Sample]) -> Iterator[Row]:
 
 def line(samples: Sequence[Sample]) -> Iterator[Row]:
     """What line_use.py says."""
-    for sample in (s for s in samples if s["figure"] == "line"):
-        what = f"window {sample['window']}, of {sample['limit']} frames/s"
-        yield Row("Use of the serial line, bus → device, 115200 Bd", what, sample["percent"], "%")
+    lines = [s for s in samples if s["figure"] == "line"]
+    for window, limit in dict.fromkeys((s["window"], s["limit"]) for s in lines):
+        used = [s["percent"] for s in lines if s["window"] == window]
+        yield Row("Use of the serial line, bus → device, 115200 Bd", f"window {window}, of {limit} frames/s",
+                  statistics.median(used), "%", spread=(min(used), max(used)))  # fmt: skip
 
 
 def process(samples: Sequence[Sample]) -> Iterator[Row]:
