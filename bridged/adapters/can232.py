@@ -127,7 +127,7 @@ class Can232:
         until they are on the bus, if others take up no more than half of it.
         """
         if drain:
-            answer = yield self.sync  # answered after all frames
+            answer = yield self.sync._replace(accept=ANYTHING, reject=())  # answered after all frames
             if answer.reply is TEXT:
                 yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
         yield from self._close()

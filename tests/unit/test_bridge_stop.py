@@ -1,0 +1,36 @@
+"""The end of a bridge on a CAN232."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_bridge import FRAME, Bench, run_until, started, stopped
+
+from bridged.simulators.can232 import TRANSMIT_FIFO, Can232
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path, monkeypatch)) as b:
+        yield b
+
+
+def test_what_it_has_taken_is_on_the_bus_before_it_is_closed(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge("bitrate: 10000"))
+    for n in range(TRANSMIT_FIFO):
+        bench.bus.far.send(FRAME.pack(n, 8, bytes(8)))
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == TRANSMIT_FIFO)
+    stopped(bridge)
+    assert [f.can_id for f in bench.frames] == list(range(TRANSMIT_FIFO))
+
+
+def test_a_stop_does_not_need_an_answer(bench: Bench) -> None:
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge())
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-active")
+    bench.device.silent = True
+    stopped(bridge)
+    assert bridge.reason == ""
