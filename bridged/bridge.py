@@ -376,8 +376,8 @@ class Bridge:
         bus_state = self._polling.health.state
         self._polling.stop()
         stopping = self.state is State.STOPPING
-        # What an error-passive one has taken may be there for long.
-        drain = stopping and bus_state is not None and bus_state < BusState.ERROR_PASSIVE
+        # What one that is error-passive has taken may be there for long. (Some firmware does not tell.)
+        drain = stopping and (bus_state is None or bus_state < BusState.ERROR_PASSIVE)
         gate = _relay.GATE_STOPPED if stopping else _relay.GATE_AWAY
         self._relay.set_gates(receiving=not self._exchanges.running, transmit=gate)
         self._exchanges.run(self.adapter.close_steps(drain), Event.CLOSED)

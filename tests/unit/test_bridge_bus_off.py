@@ -211,6 +211,17 @@ def test_only_a_stop_waits_for_what_the_adapter_has_taken(
     assert closings.drains == [False, True]
 
 
+def test_a_stop_waits_where_nothing_is_known_of_the_bus(
+    can232: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    can232.plug_in(Can232(time.monotonic()))
+    bridge = started(can232.bridge())
+    closings = Closings(bridge, monkeypatch)
+    assert bridge.snapshot()["bus_state"] is None  # not asked yet
+    stopped(bridge)
+    assert closings.drains == [True]
+
+
 def test_a_stop_does_not_wait_for_an_error_passive_adapter(
     can232: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
