@@ -84,6 +84,7 @@ class Bridge:
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._opening = False  # a thread opens the port
+        self._plugged_in = False  # since the last try
         self._starts = 0  # how often it began to run
         self._identity: object = None  # that was told
         self._bus_off = BusOff(config, self.adapter, self._dispatch)
@@ -145,6 +146,7 @@ class Bridge:
             self._on_event(kind, token, text)
         if self.state in LOOKING_OUT and self._watch.has_come():
             log.info("%s was plugged in", self.config.adapter.port)
+            self._plugged_in = True
             self._dispatch(Event.APPEARED)
 
     def next_timer(self) -> float | None:
@@ -343,11 +345,15 @@ class Bridge:
         if isinstance(result, PortError):
             if not self.finished:
                 self._watch.arm()  # before the look, or it might come between
-            event = Event.OPEN_FAILED if self._watch.is_there() else Event.ABSENT
-            self._dispatch(event, str(result))
+            there = self._watch.is_there()
+            self._dispatch(Event.OPEN_FAILED if there else Event.ABSENT, str(result))
+            if there and self._plugged_in and self.state is State.BACKOFF:
+                self._plugged_in = False  # it was opened in the middle of that, and is not told again
+                self._dispatch(Event.APPEARED)
             return
         if isinstance(result, Exception):
             raise result
+        self._plugged_in = False
         self._port = result
         self._relay.attach_port(result.fd)
         self._dispatch(Event.OPENED)

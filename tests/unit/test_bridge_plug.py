@@ -1,0 +1,51 @@
+"""An adapter that is plugged in, and opened in the middle of that."""
+
+import contextlib
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_bridge import Bench, run_until, started, stopped
+
+from bridged import bridge as bridge_module
+from bridged.errors import PortError
+from bridged.lifecycle import State
+from bridged.ports import Port, open_port
+from bridged.simulators.can232 import Can232
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path, monkeypatch)) as b:
+        yield b
+
+
+@pytest.mark.parametrize("failures", [1, 2])
+def test_one_more_try_at_once(bench: Bench, monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
+    """The news comes once, and the pause would last a minute; but what fails again waits for it."""
+    bridge = bench.bridge(more="reconnect: {initial: 60, maximum: 60}")
+    watch = bridge._watch
+    watch.close()
+    kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ours.setblocking(False)
+    watch._socket, watch.fd = ours, ours.fileno()
+    tries = []
+
+    def open_late(path: str, baudrate: int) -> Port:
+        tries.append(path)
+        if len(tries) <= failures:
+            raise PortError("no such device")
+        return open_port(path, baudrate)
+
+    with kernel:
+        started(bridge, State.WAITING)
+        monkeypatch.setattr(bridge_module, "open_port", open_late)
+        bench.plug_in(Can232(time.monotonic()))
+        name = bench.link.resolve().name
+        kernel.send(f"add@/x\0ACTION=add\0SUBSYSTEM=tty\0DEVNAME={name}\0".encode())
+        end = State.RUNNING if failures == 1 else State.BACKOFF
+        run_until(bridge, lambda: len(tries) == 2 and bridge.state is end)
+        stopped(bridge)
+    assert len(tries) == 2
