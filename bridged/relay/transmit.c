@@ -408,7 +408,8 @@ static void out_flush(struct relay *r)
     r->out_until_ns = NEVER;
 }
 
-/* Nothing waits, nothing is in flight, nothing is in the device's buffer: transmit_pump and transmit_deadline have nothing to look at. */
+/* Nothing waits, nothing is in flight, nothing is in the device's buffer: transmit_pump and transmit_deadline
+ * have nothing to look at. */
 bool transmit_idle(const struct relay *r)
 {
     bool owed = r->queue_count || r->retry_count || r->command_count || r->inflight_count || r->out_end;
