@@ -11,20 +11,20 @@ GATE_LISTEN_ONLY: Final[int]  # dropped: the channel does not send
 GATE_STOPPED: Final[int]  # dropped: the bridge is stopping
 ACCEPT_OK: Final[int]
 ACCEPT_REFUSED: Final[int]
-EVENT_OK: Final[int]
-EVENT_REFUSED: Final[int]
-EVENT_TEXT: Final[int]
-EVENT_TIMEOUT: Final[int]
-EVENT_UNASKED: Final[int]
-EVENT_NOISE: Final[int]
-EVENT_FRAME_REFUSED: Final[int]
-EVENT_UNANSWERED: Final[int]
-EVENT_SILENT: Final[int]
-EVENT_STUCK: Final[int]
-EVENT_STAMPED: Final[int]
-EVENT_PORT_LOST: Final[int]
-EVENT_BUS_DOWN: Final[int]
-EVENT_BUS_LOST: Final[int]
+EVENT_OK: Final[int]  # a command was answered "done"
+EVENT_REFUSED: Final[int]  # a command was refused
+EVENT_TEXT: Final[int]  # a command was answered with a text
+EVENT_TIMEOUT: Final[int]  # a command was not answered in time, or the port went away before
+EVENT_UNASKED: Final[int]  # a text that no command asked for
+EVENT_NOISE: Final[int]  # bytes that are no message, before frames are received
+EVENT_FRAME_REFUSED: Final[int]  # the adapter refused a frame; token: how many retries so far. Not at each
+EVENT_UNANSWERED: Final[int]  # an answer is missing: the line is being resynchronised
+EVENT_SILENT: Final[int]  # not even the sync command is answered; nothing is sent until a new attach
+EVENT_STUCK: Final[int]  # no frame has left the device's buffer for stuck_ns(); token: how many are in it, 0: not known
+EVENT_STAMPED: Final[int]  # a frame had a time stamp; said once per attach
+EVENT_PORT_LOST: Final[int]  # token: errno, 0 for end of file
+EVENT_BUS_DOWN: Final[int]  # the interface is down
+EVENT_BUS_LOST: Final[int]  # token: errno, 0 for end of file
 WINDOW_MAX: Final[int]
 
 class Relay:
@@ -97,3 +97,6 @@ def encode(codec: str, frame: bytes, /) -> bytes:
 
 def clock() -> int:
     """The relay's clock, ns: CLOCK_BOOTTIME."""
+
+def meanings() -> dict[str, dict[str, str]]:
+    """What each of `counters`, `events`, `tx_dropped` and `rx_dropped` means (relay/counters.h)."""

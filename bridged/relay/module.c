@@ -5,6 +5,7 @@
 #include <string.h>
 #include <unistd.h>
 
+#define NAME_AND_VALUE(name, ...) {#name, name},
 
 static const struct {
     const char *name;
@@ -16,20 +17,7 @@ static const struct {
     {"GATE_STOPPED", GATE_STOPPED},
     {"ACCEPT_OK", ACCEPT_OK},
     {"ACCEPT_REFUSED", ACCEPT_REFUSED},
-    {"EVENT_OK", EVENT_OK},
-    {"EVENT_REFUSED", EVENT_REFUSED},
-    {"EVENT_TEXT", EVENT_TEXT},
-    {"EVENT_TIMEOUT", EVENT_TIMEOUT},
-    {"EVENT_UNASKED", EVENT_UNASKED},
-    {"EVENT_NOISE", EVENT_NOISE},
-    {"EVENT_FRAME_REFUSED", EVENT_FRAME_REFUSED},
-    {"EVENT_UNANSWERED", EVENT_UNANSWERED},
-    {"EVENT_SILENT", EVENT_SILENT},
-    {"EVENT_STUCK", EVENT_STUCK},
-    {"EVENT_STAMPED", EVENT_STAMPED},
-    {"EVENT_PORT_LOST", EVENT_PORT_LOST},
-    {"EVENT_BUS_DOWN", EVENT_BUS_DOWN},
-    {"EVENT_BUS_LOST", EVENT_BUS_LOST},
+    EVENT_LIST(NAME_AND_VALUE)
     {"WINDOW_MAX", WINDOW_MAX},
 };
 
@@ -436,6 +424,7 @@ static PyMethodDef MODULE_METHODS[] = {
     {"decode", module_decode, METH_VARARGS, NULL},
     {"encode", module_encode, METH_VARARGS, NULL},
     {"clock", module_clock, METH_NOARGS, NULL},
+    {"meanings", module_meanings, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -1,10 +1,9 @@
-/* The relay's counters as a dict. */
+/* The relay's counters as a dict, and what the names in counters.h mean. */
 #include "module.h"
 
-static const char *const TX_DROP_NAMES[TX_DROPS] = {
-    "error-frame", "fd-frame", "malformed", "queue-full", "stale", "refused",
-    "overtaken", "unanswered", "adapter-away", "listen-only", "stopped"};
-static const char *const RX_DROP_NAMES[RX_DROPS] = {"not-running", "bus-queue-full", "bus-down", "bus-lost"};
+#define NAME_IN_PYTHON(name, python, meaning) python,
+static const char *const TX_DROP_NAMES[] = {TX_DROP_LIST(NAME_IN_PYTHON)};
+static const char *const RX_DROP_NAMES[] = {RX_DROP_LIST(NAME_IN_PYTHON)};
 
 static int dict_set(PyObject *dict, const char *name, uint64_t value)
 {
@@ -23,29 +22,17 @@ static PyObject *reasons_dict(const char *const *names, const uint64_t *values, 
     return dict;
 }
 
+#define NAME_AND_VALUE(field, python, meaning) {python, c->field},
+
 PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64_t pending)
 {
     const struct {
         const char *name;
         uint64_t value;
     } plain[] = {
-        {"bus_read", c->bus_read},
-        {"tx_frames", c->confirmed},
-        {"tx_retries", c->retries},
-        {"tx_returned", c->returned},
-        {"tx_stops", c->stops},
+        COUNTER_LIST(NAME_AND_VALUE)
         {"queued", queued},
-        {"decoded", c->decoded},
-        {"rx_frames", c->delivered},
         {"rx_pending", pending},
-        {"rx_overruns", c->overruns},
-        {"rx_stamped", c->stamped},
-        {"skipped_messages", c->skipped_messages},
-        {"skipped_bytes", c->skipped_bytes},
-        {"stray_answers", c->stray_answers},
-        {"resyncs", c->resyncs},
-        {"events_lost", c->events_lost},
-        {"turns", c->turns},
     };
     PyObject *dict = PyDict_New();
     for (size_t i = 0; dict && i < sizeof plain / sizeof plain[0]; i++)
@@ -59,4 +46,42 @@ PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64_t pend
     Py_XDECREF(tx);
     Py_XDECREF(rx);
     return dict;
+}
+
+#define NAME_AND_MEANING(name, python, meaning) {python, meaning},
+#define EVENT_AND_MEANING(name, meaning) {#name, meaning},
+
+struct meaning {
+    const char *name, *text;
+};
+
+static const struct meaning TX_DROP_MEANINGS[] = {TX_DROP_LIST(NAME_AND_MEANING) {0}};
+static const struct meaning RX_DROP_MEANINGS[] = {RX_DROP_LIST(NAME_AND_MEANING) {0}};
+static const struct meaning EVENT_MEANINGS[] = {EVENT_LIST(EVENT_AND_MEANING) {0}};
+static const struct meaning COUNTER_MEANINGS[] = {COUNTER_LIST(NAME_AND_MEANING) {0}};
+
+static int add_meanings(PyObject *all, const char *key, const struct meaning *m)
+{
+    PyObject *dict = PyDict_New();
+    int result = dict ? 0 : -1;
+    for (; !result && m->name; m++) {
+        PyObject *text = PyUnicode_FromString(m->text);
+        result = text ? PyDict_SetItemString(dict, m->name, text) : -1;
+        Py_XDECREF(text);
+    }
+    if (!result)
+        result = PyDict_SetItemString(all, key, dict);
+    Py_XDECREF(dict);
+    return result;
+}
+
+PyObject *module_meanings(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(ignored))
+{
+    PyObject *all = PyDict_New();
+    if (all
+        && (add_meanings(all, "counters", COUNTER_MEANINGS) < 0 || add_meanings(all, "events", EVENT_MEANINGS) < 0
+            || add_meanings(all, "rx_dropped", RX_DROP_MEANINGS) < 0
+            || add_meanings(all, "tx_dropped", TX_DROP_MEANINGS) < 0))
+        Py_CLEAR(all);
+    return all;
 }

@@ -14,6 +14,7 @@
 #include <sys/socket.h>
 
 #include "codec.h"
+#include "counters.h"
 
 #define NS_PER_S INT64_C(1000000000)
 #define NEVER INT64_MAX
@@ -35,52 +36,8 @@ enum {
     SYNC_TRIES = 3,       /* unanswered sync commands until the adapter counts as silent */
 };
 
-/* Why a frame from the bus was not sent. Order of TX_DROP_NAMES in module.c. */
-enum tx_drop {
-    TX_ERROR_FRAME,  /* error frames are the bus's own affair */
-    TX_FD_FRAME,     /* the adapter knows classic CAN only */
-    TX_MALFORMED,    /* no struct can_frame, or one the protocol cannot say */
-    TX_QUEUE_FULL,   /* the transmit queue was full */
-    TX_STALE,        /* older than the deadline before its turn came */
-    TX_REFUSED,      /* the adapter refused it, or handed it back, until its deadline */
-    TX_OVERTAKEN,    /* refused, and a later frame was taken: sending it now would swap them */
-    TX_UNANSWERED,   /* sent, but no answer came: it may or may not be on the bus, so it is not sent again */
-    TX_AWAY,         /* no adapter, or not initialised */
-    TX_LISTEN_ONLY,  /* the channel is listen-only */
-    TX_STOPPED,      /* the bridge is stopping */
-    TX_DROPS,
-};
-
-/* Why a frame from the adapter did not reach the bus. Order of RX_DROP_NAMES in module.c. */
-enum rx_drop {
-    RX_NOT_RUNNING, /* decoded while the adapter was being initialised or closed */
-    RX_BUS_FULL,    /* ENOBUFS, EAGAIN for longer than RX_STALL_NS, or more than RX_BATCH waiting */
-    RX_BUS_DOWN,    /* ENETDOWN */
-    RX_BUS_LOST,    /* interface gone, or none attached */
-    RX_DROPS,
-};
-
 /* What happens to frames read from the bus. */
 enum gate { GATE_AWAY, GATE_OPEN, GATE_LISTEN_ONLY, GATE_STOPPED, GATES };
-
-enum event_kind {
-    EVENT_OK,        /* a command was answered "done" */
-    EVENT_REFUSED,   /* a command was refused */
-    EVENT_TEXT,      /* a command was answered with a text */
-    EVENT_TIMEOUT,   /* a command was not answered in time, or the port went away before */
-    EVENT_UNASKED,   /* a text that no command asked for */
-    EVENT_NOISE,     /* bytes that are no message, before frames are received */
-    EVENT_FRAME_REFUSED, /* the adapter refused a frame; token: how many retries so far. Not at each */
-    EVENT_UNANSWERED,    /* an answer is missing: the line is being resynchronised */
-    EVENT_SILENT,    /* not even the sync command is answered; nothing is sent until a new attach */
-    EVENT_STUCK,     /* frames are in the device's buffer and none has left it for stuck_ns(); token: how many,
-                        0: not known */
-    EVENT_STAMPED,   /* a frame had a time stamp; said once per attach */
-    EVENT_PORT_LOST, /* token: errno, 0 for end of file */
-    EVENT_BUS_DOWN,  /* the interface is down */
-    EVENT_BUS_LOST,  /* token: errno, 0 for end of file */
-    EVENT_KINDS,
-};
 
 /* Answers that settle a command; a text settles it when it begins with the command's prefix, if it has one. */
 enum { ACCEPT_OK = 1, ACCEPT_REFUSED = 2 };
@@ -126,26 +83,6 @@ struct event {
     uint16_t length;
     uint32_t token;
     uint8_t text[EVENT_SIZE];
-};
-
-struct counters {
-    uint64_t bus_read;  /* frames read from the bus */
-    uint64_t confirmed; /* frames that the adapter took */
-    uint64_t retries;   /* frames sent once more after a refusal */
-    uint64_t returned;  /* frames that the adapter handed back */
-    uint64_t stops;     /* how often the adapter said that its transmit buffer is nearly full */
-    uint64_t tx_dropped[TX_DROPS];
-    uint64_t decoded;   /* frames decoded from the port */
-    uint64_t delivered; /* frames put on the bus */
-    uint64_t rx_dropped[RX_DROPS];
-    uint64_t overruns;         /* how often the adapter said that it lost frames */
-    uint64_t stamped;          /* frames that carried a time stamp */
-    uint64_t skipped_messages; /* pieces of noise between messages */
-    uint64_t skipped_bytes;
-    uint64_t stray_answers;    /* answers that nothing was waiting for */
-    uint64_t resyncs;
-    uint64_t events_lost;
-    uint64_t turns; /* how often the loop woke */
 };
 
 struct settings {
