@@ -20,9 +20,7 @@ EVENT_NOISE: Final[int]  # bytes that are no message, before frames are received
 EVENT_FRAME_REFUSED: Final[int]  # the adapter refused a frame; token: how many retries so far. Not at each
 EVENT_UNANSWERED: Final[int]  # an answer is missing: the line is being resynchronised
 EVENT_SILENT: Final[int]  # not even the sync command is answered; nothing is sent until a new attach
-EVENT_STUCK: Final[
-    int
-]  # no frame has left the device's buffer for stuck_ns(); token: how many are in it, 0: not known
+EVENT_STUCK: Final[int]  # no frame has left the device's buffer for stuck_ns(); token: how many, 0: not known
 EVENT_STAMPED: Final[int]  # a frame had a time stamp; said once per attach
 EVENT_PORT_LOST: Final[int]  # token: errno, 0 for end of file
 EVENT_BUS_DOWN: Final[int]  # the interface is down
