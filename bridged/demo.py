@@ -27,12 +27,14 @@ from bridged.memory import FileMemory
 from bridged.service import serve
 from bridged.simulators.can232 import Can232
 from bridged.simulators.commands import ADAPTERS, STOP_GRACE_S, positive
-from bridged.simulators.serve import Device, Simulator
+from bridged.simulators.serve import Simulator
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
+
+    from bridged.simulators.device import Device
 
 CHANNEL = "vcan0"
 UART_RATE = 115_200

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from bridged.simulators.can232 import Can232
-    from bridged.simulators.serve import Device
+    from bridged.simulators.device import Device
     from bridged.simulators.usb2can import Usb2can
 
 BUS_FAULTS = ("warning", "passive", "busoff")

@@ -14,7 +14,7 @@ import select
 import socket
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from bridged.simulators import faults
 from bridged.simulators.ends import BusEnd, HeldUp, HostEnd, LineEnd, PtyEnd
@@ -22,15 +22,15 @@ from bridged.simulators.faults import BURST_S, Fault
 from bridged.simulators.sja1000 import Frame
 
 if TYPE_CHECKING:
-    import enum
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
     from typing import BinaryIO
 
     from bridged.simulators.can232_memory import Eeprom
+    from bridged.simulators.device import Device
     from bridged.simulators.uart import Uart
 
-__all__ = ["Device", "Fault", "Simulator", "mixed_frames", "record_line"]
+__all__ = ["Fault", "Simulator", "mixed_frames", "record_line"]
 
 UART_QUEUE = 4096  # characters a host's UART takes for a paced line before its write waits
 SPIN_S = 0.001  # --precise: no sleeping so close to a deadline,
@@ -64,40 +64,6 @@ def write_json(path: Path, value: object) -> None:
     new = path.with_name(f".{path.name}.new")
     new.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
     new.replace(path)
-
-
-class _Unseen(Protocol):
-    frames_unseen: int
-
-
-class Device(Protocol):
-    """What a Simulator asks of a device: see `Can232`.
-
-    One with an attribute `uart` is asked for the pace of its line, one with an `eeprom` to have it kept.
-    """
-
-    silent: bool
-    refusals: int
-    drop_answers: int
-
-    @property
-    def state(self) -> enum.Enum: ...
-    @property
-    def counters(self) -> _Unseen: ...
-    def power_on(self, now: float) -> None: ...
-    def power_off(self, now: float) -> None: ...
-    def power_cycle(self, now: float) -> None: ...
-    def set_bus_off(self, now: float, bus_off: bool) -> None: ...
-    def set_listen_only(self, now: float, listen_only: bool) -> None: ...
-    def set_error_counters(self, now: float, tec: int, rec: int) -> None: ...
-    def garbage(self, now: float, noise: bytes) -> None: ...
-    def host_writes(self, now: float, data: bytes) -> None: ...
-    def bus_frame(self, now: float, frame: Frame) -> None: ...
-    def advance(self, now: float) -> None: ...
-    def take_output(self, now: float) -> bytes: ...
-    def take_bus_frames(self) -> list[Frame]: ...
-    def next_deadline(self) -> float: ...
-    def report(self) -> dict[str, object]: ...
 
 
 class Simulator:

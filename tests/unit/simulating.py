@@ -13,8 +13,9 @@ from pathlib import Path
 
 import bridged
 from bridged.simulators.can232 import Can232
+from bridged.simulators.device import Device
 from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, parse_fault
-from bridged.simulators.serve import Device, Simulator
+from bridged.simulators.serve import Simulator
 
 TIMEOUT_S = 20
 
