@@ -279,7 +279,10 @@ class Usb2can:
         if before is None:
             return False
         after = yield from self._read_levels()
-        return after == Levels(self._critical, self._ready, 0)
+        if after == Levels(self._critical, self._ready, 0):
+            return True
+        self._levels_prefix = None  # what it tells are not levels
+        return False
 
     def _find_levels(self) -> Generator[Exchange, Answer, Levels | None]:
         """COMMAND GET, whose answer begins with its code or does not."""

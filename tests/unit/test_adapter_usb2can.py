@@ -168,10 +168,14 @@ def test_parameters_that_are_not_what_was_set_are_not_believed(answer: str) -> N
             return bytes.fromhex(answer)
 
     device = Odd()
-    flow = started(device).adapter.flow
+    host = started(device)
+    flow = host.adapter.flow
     assert flow
     assert flow.request == bytes.fromhex("0F 10 01 00")
     assert_open(device)
+    begin = host.now
+    host.close()  # nor are they for the frames that it has to send yet
+    assert (host.now - begin < 0.01, host.adapter.discarded) == (True, 0)
     assert device.violations == []
 
 
