@@ -186,10 +186,10 @@ class HealthPolling:
         if self._refused:
             self._refused = False
             self._warn("adapter refuses frames; its status: %s", seen.description)
+        self._unknown = self._unknown + 1 if seen is UNKNOWN else 0
         if self._overtaken:
             seen = seen._replace(state=None, tec=None, rec=None)
         self._take(seen)
-        self._unknown = self._unknown + 1 if seen is UNKNOWN else 0
         if self._unknown == UNKNOWN_LIMIT:
             self._failed("the adapter does not answer questions about its bus")
             return

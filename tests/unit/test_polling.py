@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from bridged.adapters.base import Answer, Exchange, Reply
 from bridged.errors import AdapterError
-from bridged.health import BusState, Observation, error_frame
-from bridged.polling import HealthPolling
+from bridged.health import UNKNOWN, BusState, Observation, error_frame
+from bridged.polling import UNKNOWN_LIMIT, HealthPolling
 
 
 class Adapter:
@@ -98,6 +98,20 @@ def test_answers_older_than_what_the_adapter_says_by_itself_are_not_believed() -
     bench.answer()
     assert bench.polling.health.state is BusState.ERROR_PASSIVE
     assert len(bench.told) == 1
+
+
+def test_one_that_speaks_unasked_but_answers_nothing_is_initialised_again() -> None:
+    bench = Bench()
+    bench.adapter.seen = UNKNOWN
+    bench.adapter.report = Observation("passive", BusState.ERROR_PASSIVE, tec=130, rec=0)
+    for _ in range(UNKNOWN_LIMIT):
+        assert bench.failed == []
+        bench.polling.on_timer(1e9)
+        bench.answer()
+        bench.polling.heard(b"...")
+        bench.answer()
+    assert bench.failed == ["the adapter does not answer questions about its bus"]
+    assert bench.polling.health.state is BusState.ERROR_PASSIVE
 
 
 def test_a_frame_refused_between_two_rounds_is_explained_at_once() -> None:
