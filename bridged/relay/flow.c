@@ -11,7 +11,7 @@
 #define ASK_FIRST_NS INT64_C(1000000)
 #define ASK_LAST_NS INT64_C(16000000)
 #define STOP_LOOK_NS INT64_C(50000000)   /* how often the level is looked at while stopped: "go" may be lost */
-#define STOP_LIMIT_NS INT64_C(500000000) /* after this a stop without a start ends by trial */
+#define STOP_LIMIT_NS INT64_C(500000000) /* after this a stop without a "go" ends by trial, where the level is not told */
 #define RETURNS_TOLD 64
 
 bool flow_used(const struct relay *r)
@@ -149,12 +149,16 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
         f->limit = 2 * f->limit < r->set.window ? 2 * f->limit : r->set.window;
     f->settling = f->settling && f->sent_count;
 
+    /* A "go" may be lost: the level says the same. Where none is told, one frame goes after some time, to see. */
     int level = r->set.codec->level(msg->text, msg->length);
-    if (f->stopped)
-        f->stopped = !(level >= 0 && level < (int)f->ready) && now - f->stopped_ns < STOP_LIMIT_NS;
+    bool trial = f->stopped && level < 0 && now - f->stopped_ns >= STOP_LIMIT_NS;
+    if (trial || (level >= 0 && level < (int)f->ready))
+        f->stopped = false;
     if (level >= 0) {
         level_observe(r, (uint32_t)level, taken_count);
         f->room = room_above(f, (uint32_t)level);
+    } else if (trial) {
+        f->room = !f->sent_count;
     } else {
         f->room = f->critical < f->capacity ? room_above(f, f->critical) : !f->sent_count;
     }

@@ -56,6 +56,61 @@ def test_a_stop_without_start_ends(device: dict[str, Any]) -> None:
         assert (c["tx_frames"], c["tx_dropped"]) == (40, 0)
 
 
+@pytest.mark.parametrize("lose_go", [0, 1])
+def test_a_stop_lasts_as_long_as_the_level_is_not_below_ready(lose_go: int) -> None:
+    with rig_with(deadline=60.0) as rig:
+        rig.device.lose_go = lose_go
+        rig.device.set_bus_off(rig.now / S, True)
+        rig.send(*(numbered(n) for n in range(40)))
+        rig.run(0.1)
+        assert rig.counters()["tx_stops"] == 1
+        taken = rig.device.counters.frames_taken
+        rig.run(10.0)
+        assert rig.device.counters.frames_taken == taken
+        rig.device.set_bus_off(rig.now / S, False)
+        rig.run_until_done(2.0)
+        assert_in_order(rig, [numbered(n) for n in range(40)])
+
+
+def test_a_stop_that_never_ends_is_noticed_and_nothing_goes_late() -> None:
+    with rig_with(deadline=0.5) as rig:
+        rig.device.set_bus_off(rig.now / S, True)
+        rig.send(*(numbered(n) for n in range(40)))
+        rig.run(2.0)
+        (frames,) = [token for kind, token, _ in rig.take_events() if kind == _relay.EVENT_STUCK]
+        c = rig.counters()
+        assert (frames, c["tx_frames"], c["stale"], c["queued"]) == (frames, frames, 40 - frames, 0)
+        rig.relay.set_gates(receiving=True, transmit=_relay.GATE_AWAY)  # as bridge.py does when it is stuck
+        rig.perform(rig.adapter.close_steps(drain=False))
+        rig.device.set_bus_off(rig.now / S, False)
+        rig.relay.detach_port()
+        rig.relay.attach_port(rig._near_port)
+        rig.perform(rig.adapter.init_steps(None))
+        rig.open()
+        rig.send(numbered(100))
+        rig.run_until_done()
+        assert rig.sent == [numbered(100)]
+        assert rig.device.counters.frames_discarded == frames
+
+
+def test_a_stop_without_start_is_tried_with_one_frame_where_no_level_is_told() -> None:
+    with rig_with(answers_get=False, bitrate=10_000) as rig:
+        rig.send(numbered(0))
+        rig.run_until_done()
+        rig.device.garbage(rig.now / S, STOP)
+        rig.run(0.01)
+        taken = rig.device.counters.frames_taken
+        rig.send(*(numbered(n) for n in range(1, 10)))
+        rig.run(0.48)
+        assert rig.device.counters.frames_taken == taken
+        while rig.device.counters.frames_taken == taken:
+            rig.run(0.000125)
+        rig.run(0.0005)
+        assert rig.device.counters.frames_taken == taken + 1
+        rig.run_until_done()
+        assert_in_order(rig, [numbered(n) for n in range(10)])
+
+
 @FIRMWARE
 @pytest.mark.parametrize("burst", [1, 3, 16, 50])
 def test_frames_handed_back_go_again_in_their_place(device: dict[str, Any], burst: int) -> None:
