@@ -18,8 +18,9 @@ for tool in gcc valgrind; do
 done
 compiler="$(gcc --version | head -n 1) $(uname -m)"
 program=$build/instructions
+# shellcheck disable=SC2046 # names without spaces
 gcc -std=c11 -O2 -g -Wall -Wextra -Wno-missing-field-initializers -Werror -D_GNU_SOURCE -pthread -Wl,--wrap=syscall \
-    "$native/instructions.c" "$relay/relay.c" "$relay/transmit.c" "$relay/queue.c" "$relay/flow.c" "$relay"/codec_*.c -o "$program"
+    "$native/instructions.c" $(find "$relay" -name '*.c' ! -name 'module*') -o "$program"
 
 # count NAME FUNCTION ARGUMENT…: prints "INSTRUCTIONS NAME", for one frame, of FUNCTION and what it calls.
 count() {
