@@ -59,7 +59,7 @@ def _run(args: argparse.Namespace) -> int:
     from bridged.memory import FileMemory, state_directory  # noqa: PLC0415
     from bridged.notify import systemd_notifier  # noqa: PLC0415
     from bridged.service import Service, hangup_means_reload  # noqa: PLC0415
-    from bridged.status import StatusServer, render, socket_path  # noqa: PLC0415
+    from bridged.status import StatusServer, own_socket_path, render  # noqa: PLC0415
 
     config = _load(args.config)
     notifier = systemd_notifier()
@@ -75,7 +75,7 @@ def _run(args: argparse.Namespace) -> int:
 
     service = Service(Bridge(config, memory), notifier, successor if hangup_means_reload() else None)
     fields.state = lambda: service.bridge.state.value
-    status = StatusServer(args.socket or socket_path(config.name), snapshot)
+    status = StatusServer(args.socket or own_socket_path(config.name), snapshot)
     gc.freeze()  # what is loaded stays
     gc.enable()
     try:
@@ -99,14 +99,14 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _status_path(args: argparse.Namespace) -> Path:
-    from bridged.status import StatusError, running_sockets, socket_path  # noqa: PLC0415
+    from bridged.status import StatusError, running_sockets, runtime_directory  # noqa: PLC0415
 
     if args.socket:
         return Path(args.socket)
     running = running_sockets()
     if args.name:
         name = config_path(args.name).stem
-        return next((path for path in running if path.stem == name), socket_path(name))
+        return next((path for path in running if path.stem == name), runtime_directory() / f"{name}.sock")
     if len(running) == 1:
         return running[0]
     names = ", ".join(path.stem for path in running)

@@ -16,10 +16,13 @@ At any moment bus_read = tx_frames + queued + tx_dropped (but for LOST_BEFORE_RE
 from __future__ import annotations
 
 import contextlib
+import errno
 import grp
 import os
+import pwd
 import socket
 import stat
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,26 +32,57 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ANSWER_TIMEOUT_S = 5.0
+ANSWER_MAX = 1 << 20
 SYSTEM_DIRECTORY = Path("/run/can-bridge")
+FALLBACK_DIRECTORY = "/tmp/can-bridge-{uid}"  # without XDG_RUNTIME_DIR: su, cron, containers
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 GROUP = "can-bridge"  # systemd/can-bridge.sysusers
 # Reasons in tx_dropped for frames that were lost before the relay could read them.
 LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow", "bus-recv-failed")
 
 
 class StatusError(BridgeError):
-    """The status socket could not be made, or nobody answers on it."""
+    """The status socket could not be made, or what answers on it is no status."""
+
+
+class NoAnswerError(StatusError):
+    """No bridge runs behind the status socket, or it does not answer."""
 
 
 def runtime_directory() -> Path:
-    """/run/can-bridge for root, below XDG_RUNTIME_DIR for anybody else."""
+    """Where the status sockets of this user's bridges are: /run/can-bridge for root."""
     if os.geteuid() == 0:
         return SYSTEM_DIRECTORY
-    base = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/can-bridge-{os.geteuid()}"
-    return Path(base) / "can-bridge"
+    if base := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(base) / "can-bridge"
+    return Path(FALLBACK_DIRECTORY.format(uid=os.geteuid()))
 
 
-def socket_path(name: str) -> Path:
-    return runtime_directory() / f"{name}.sock"
+def own_socket_path(name: str) -> Path:
+    """Where this user's bridge `name` makes its status socket; the directory is made if it is missing.
+
+    StatusError: somebody else owns the directory or may write in it (anybody can make the one in /tmp first),
+    and could put another socket in the place of ours. Root's lies in /run, which only root can write in.
+    """
+    directory = runtime_directory()
+    try:
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+        found = directory.lstat()
+    except OSError as error:
+        raise StatusError(_cannot_make(directory / f"{name}.sock", error)) from error
+    if os.geteuid() != 0:
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+            whose = (
+                "is no directory"
+                if not stat.S_ISDIR(found.st_mode)
+                else f"belongs to {user_name(found.st_uid)}"
+            )
+            msg = f"{directory} {whose}: remove it, set XDG_RUNTIME_DIR, or give --socket PATH"
+            raise StatusError(msg)
+        if found.st_mode & OTHERS_WRITE:
+            msg = f"other users may write in {directory}: chmod go-w {directory}, or give --socket PATH"
+            raise StatusError(msg)
+    return directory / f"{name}.sock"
 
 
 def running_sockets() -> list[Path]:
@@ -58,27 +92,32 @@ def running_sockets() -> list[Path]:
 
 
 class StatusServer:
-    """Listens on a Unix socket; on_readable() answers everybody who waits, without ever waiting itself."""
+    """Listens on a Unix socket; on_readable() answers everybody who waits, without ever waiting itself.
+
+    Root may be asked to listen in a directory of another user, who can exchange the socket for a link at any
+    moment. So its mode and group come from the process when it is made, and what is done by its name later is
+    done relative to the open directory and follows no link.
+    """
 
     def __init__(self, path: Path, snapshot: Callable[[], dict[str, Any]]) -> None:
         """StatusError: another bridge listens there, or the socket cannot be made."""
         self.path = path
         self._snapshot = snapshot
+        self._directory = -1
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-            _clear_away(path)
-            self._socket.bind(str(path))
-            _admit_group(path)
-            self._inode = path.stat().st_ino
+            self._directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+            self._clear_away()
+            with _for_owner_and_group():
+                self._socket.bind(str(path))
+            self._inode = self._lstat().st_ino
             self._socket.listen(16)
         except OSError as error:
-            self._socket.close()
-            cause = error.strerror or error
-            msg = f"cannot make the status socket {path}: {cause}; --socket PATH puts it elsewhere"
-            raise StatusError(msg) from error
+            self._release()
+            raise StatusError(_cannot_make(path, error)) from error
         except StatusError:
-            self._socket.close()
+            self._release()
             raise
 
     def fileno(self) -> int:
@@ -101,71 +140,130 @@ class StatusServer:
                 return
 
     def close(self) -> None:
-        self._socket.close()
         with contextlib.suppress(OSError):
-            if self.path.lstat().st_ino == self._inode:
-                self.path.unlink()
+            if self._lstat().st_ino == self._inode:
+                self._unlink()
+        self._release()
 
+    def _release(self) -> None:
+        self._socket.close()
+        if self._directory >= 0:
+            os.close(self._directory)
+            self._directory = -1
 
-def _admit_group(path: Path) -> None:
-    """For the owner and the service's group, if there is one, or the owner's."""
-    if os.geteuid() == 0:
-        with contextlib.suppress(KeyError, OSError):  # no such group: not installed as a service; a container
-            os.chown(path, -1, grp.getgrnam(GROUP).gr_gid)
-    path.chmod(0o660)
+    def _lstat(self) -> os.stat_result:
+        return os.stat(self.path.name, dir_fd=self._directory, follow_symlinks=False)
 
+    def _unlink(self) -> None:
+        os.unlink(self.path.name, dir_fd=self._directory)
 
-def _clear_away(path: Path) -> None:
-    """Removes the socket that a dead bridge left; StatusError for anything else that is there."""
-    try:
-        if not stat.S_ISSOCK(path.lstat().st_mode):
-            msg = f"{path} exists and is no socket: --socket PATH wants a place of its own"
-            raise StatusError(msg)
-    except FileNotFoundError:
-        return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(1.0)
+    def _clear_away(self) -> None:
+        """Removes the socket that a dead bridge left; StatusError for anything else that is there."""
         try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
-            path.unlink()
+            if not stat.S_ISSOCK(self._lstat().st_mode):
+                msg = f"{self.path} exists and is no socket: --socket PATH wants a place of its own"
+                raise StatusError(msg)
+        except FileNotFoundError:
             return
-        except TimeoutError:
-            pass
-    msg = f"a bridge named {path.stem!r} is running already (it answers on {path})"
-    raise StatusError(msg)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.settimeout(1.0)
+            try:
+                probe.connect(str(self.path))
+            except ConnectionRefusedError:
+                self._unlink()
+                return
+            except TimeoutError:
+                pass
+        msg = f"a bridge named {self.path.stem!r} is running already (it answers on {self.path})"
+        raise StatusError(msg)
+
+
+@contextlib.contextmanager
+def _for_owner_and_group() -> Iterator[None]:
+    """What is made meanwhile is for its owner and a group, root's for that of the service if there is one."""
+    mask, group = os.umask(0o117), os.getegid()
+    try:
+        if os.geteuid() == 0:
+            with contextlib.suppress(
+                KeyError, OSError
+            ):  # no such group: not installed as a service; a container
+                os.setegid(grp.getgrnam(GROUP).gr_gid)
+        yield
+    finally:
+        os.umask(mask)
+        os.setegid(group)
+
+
+def _cannot_make(path: Path, error: OSError) -> str:
+    return f"cannot make the status socket {path}: {error.strerror or error}; --socket PATH puts it elsewhere"
 
 
 def query(path: Path) -> dict[str, Any]:
-    """The status of the bridge behind `path`. StatusError: none is running there."""
+    """The status of the bridge behind `path`. StatusError: none is running there, or it may not be asked.
+
+    Anybody may listen there: what answers is given ANSWER_TIMEOUT_S and ANSWER_MAX bytes, no more.
+    """
     import json  # noqa: PLC0415 - as above
 
-    data = b""
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(ANSWER_TIMEOUT_S)
-            client.connect(str(path))
-            while chunk := client.recv(65536):
-                data += chunk
-        status = json.loads(data)
+        status = json.loads(_read_answer(path))
     except PermissionError as error:
-        group = _group_name(path.stat().st_gid)
-        msg = f"no permission for {path}: usermod -aG {group} USER, then log in again; or be root"
-        raise StatusError(msg) from error
-    except (OSError, ValueError) as error:
-        msg = f"no bridge answers on {path}: {error}"
-        raise StatusError(msg) from error
-    if not isinstance(status, dict) or "counters" not in status:
-        msg = f"what answers on {path} is no bridge"
-        raise StatusError(msg)
+        raise StatusError(f"no permission for {path}: {_who_may(path)}") from error
+    except TimeoutError as error:
+        msg = f"the bridge behind {path} does not answer within {ANSWER_TIMEOUT_S:g} s: is it stopped?"
+        raise NoAnswerError(msg) from error
+    except OSError as error:
+        msg = f"no bridge answers on {path}: {error.strerror or error}"
+        raise NoAnswerError(msg) from error
+    except (ValueError, RecursionError):
+        status = None
+    if not isinstance(status, dict) or not isinstance(status.get("counters"), dict):
+        raise StatusError(f"what answers on {path} is no bridge")
     return status
 
 
-def _group_name(gid: int) -> str:
+def _read_answer(path: Path) -> bytes:
+    deadline = time.monotonic() + ANSWER_TIMEOUT_S
+    data = bytearray()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.settimeout(ANSWER_TIMEOUT_S)
+        client.connect(str(path))
+        while len(data) <= ANSWER_MAX:
+            remaining_s = deadline - time.monotonic()
+            if remaining_s <= 0:
+                raise TimeoutError
+            client.settimeout(remaining_s)
+            chunk = client.recv(65536)
+            if not chunk:
+                break
+            data += chunk
+    if not data:
+        raise ConnectionResetError(errno.ECONNRESET, "it ended meanwhile")
+    return bytes(data)
+
+
+def _who_may(path: Path) -> str:
+    """What somebody can do who has no permission for a status socket."""
     try:
-        return grp.getgrgid(gid).gr_name
+        found = path.stat()
+        group = grp.getgrgid(found.st_gid).gr_name
+    except (OSError, KeyError):
+        return "ask as the user who started the bridge, or as root (sudo)"
+    if group == GROUP:
+        return f"usermod -aG {GROUP} USER, then log in again; or ask as root (sudo)"
+    advice = (
+        "ask as root (sudo)" if found.st_uid == 0 else f"ask as {user_name(found.st_uid)} or as root (sudo)"
+    )
+    if path.parent == SYSTEM_DIRECTORY:
+        advice += f"; to do without, install systemd/can-bridge.sysusers and join group {GROUP}"
+    return f"it is the bridge of {user_name(found.st_uid)}: {advice}"
+
+
+def user_name(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
     except KeyError:
-        return str(gid)
+        return f"user {uid}"
 
 
 def _reasons(dropped: dict[str, int]) -> str:

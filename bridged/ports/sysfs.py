@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import Final
 
+from bridged.text import printable
+
 _SYS: Final = Path("/sys")
 _PROC: Final = Path("/proc")
 
@@ -28,7 +30,7 @@ def serial_number(directory: Path) -> str | None:
     for parent in (directory, *directory.parents):
         if (parent / "idVendor").exists():  # the device itself; further up are hubs
             with contextlib.suppress(OSError):
-                return (parent / "serial").read_text(errors="replace").strip() or None
+                return printable((parent / "serial").read_text(errors="replace").strip()) or None
             return None
     return None
 
@@ -48,5 +50,6 @@ def users(path: Path) -> list[str]:
     for process in _PROC.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # not ours, or just ended
             if any(str(link.readlink()) == device for link in (process / "fd").iterdir()):
-                found.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
+                name = printable((process / "comm").read_text(errors="replace").strip())
+                found.append(f"{name} (process {process.name})")
     return found

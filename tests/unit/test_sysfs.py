@@ -72,3 +72,8 @@ def test_ports_that_are_no_usb_devices() -> None:
     port = open_port("loop://", 57600)
     assert port.serial_number is None
     port.close()
+
+
+def test_a_serial_number_has_no_control_characters(tty: Path) -> None:
+    (tty.parents[3] / "serial").write_text("A\x1b[2J\nroot: all is well\n")
+    assert sysfs.serial_number(tty) == r"A\x1b[2J\nroot: all is well"

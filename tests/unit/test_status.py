@@ -1,0 +1,245 @@
+"""The status socket: who may ask, what others can do to it, and what a false one can do to who asks."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridged import status
+from bridged.status import NoAnswerError, StatusError, StatusServer, own_socket_path, query
+
+GROUP = 12345
+
+
+@contextlib.contextmanager
+def listening(path: Path, talk: Callable[[socket.socket], None]) -> Iterator[None]:
+    """Somebody who listens at `path` and talks to one who connects."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve() -> None:
+            with contextlib.suppress(OSError), listener.accept()[0] as connection:
+                talk(connection)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield
+        with contextlib.suppress(OSError):
+            listener.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+@contextlib.contextmanager
+def serving(path: Path, found: dict[str, Any]) -> Iterator[None]:
+    """A bridge with this status."""
+    server = StatusServer(path, lambda: found)
+    end, ended = socket.socketpair()
+
+    def serve() -> None:
+        while ended not in select.select([server, ended], [], [])[0]:
+            server.on_readable()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.close()
+        thread.join()
+        ended.close()
+        server.close()
+
+
+def answer(text: bytes) -> Callable[[socket.socket], None]:
+    return lambda connection: connection.sendall(text)
+
+
+class TestServer:
+    def test_who_asks_is_answered(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.sock"
+        with serving(path, {"counters": {}, "name": "a"}):
+            assert query(path)["name"] == "a"
+            with pytest.raises(StatusError, match="running already"):
+                StatusServer(path, dict)
+            assert query(path)["name"] == "a"
+        assert list(tmp_path.iterdir()) == []
+
+    def test_one_that_a_dead_bridge_left_is_replaced(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.sock"
+        with socket.socket(socket.AF_UNIX) as dead:
+            dead.bind(str(path))
+        StatusServer(path, dict).close()
+        path.write_text("mine")
+        with pytest.raises(StatusError, match="is no socket"):
+            StatusServer(path, dict)
+        assert path.read_text() == "mine"
+
+    def test_for_owner_and_group_whatever_the_umask(self, tmp_path: Path) -> None:
+        before = os.umask(0)
+        try:
+            server = StatusServer(tmp_path / "a.sock", dict)
+            assert os.umask(0) == 0
+        finally:
+            os.umask(before)
+        assert (tmp_path / "a.sock").stat().st_mode & 0o777 == 0o660
+        server.close()
+
+    @pytest.mark.skipif(os.geteuid() != 0, reason="only root may choose a group")
+    def test_roots_is_for_the_group_of_the_service(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        entry = status.grp.struct_group((status.GROUP, "x", GROUP, []))
+        monkeypatch.setattr(status.grp, "getgrnam", lambda _name: entry)
+        before = os.getegid()
+        server = StatusServer(tmp_path / "a.sock", dict)
+        assert ((tmp_path / "a.sock").stat().st_gid, os.getegid()) == (GROUP, before)
+        server.close()
+
+    def test_a_link_put_in_its_place_is_not_followed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Who owns the directory can exchange the socket once it is there; here that always succeeds."""
+        secret = tmp_path / "secret"
+        secret.write_text("secret")
+        secret.chmod(0o600)
+        before = secret.stat()
+        entry = status.grp.struct_group((status.GROUP, "x", GROUP, []))
+        monkeypatch.setattr(status.grp, "getgrnam", lambda _name: entry)
+
+        class Exchanged(socket.socket):
+            def bind(self, address: Any) -> None:
+                super().bind(address)
+                Path(address).unlink()
+                Path(address).symlink_to(secret)
+
+        monkeypatch.setattr(status.socket, "socket", Exchanged)
+        server = StatusServer(tmp_path / "a.sock", dict)
+        server.close()
+        after = secret.stat()
+        assert (after.st_mode, after.st_uid, after.st_gid) == (before.st_mode, before.st_uid, before.st_gid)
+        assert secret.read_text() == "secret"
+
+
+class TestDirectory:
+    @pytest.fixture
+    def fallback(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """The directory of a user without XDG_RUNTIME_DIR."""
+        monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+        monkeypatch.setattr(status, "FALLBACK_DIRECTORY", f"{tmp_path}/can-bridge-{{uid}}")
+        uid = os.geteuid() or GROUP
+        monkeypatch.setattr(os, "geteuid", lambda: uid)
+        return tmp_path / f"can-bridge-{uid}"
+
+    def test_ours_is_made_and_used(self, fallback: Path) -> None:
+        if os.getuid() == 0:
+            fallback.mkdir(mode=0o755)
+            os.chown(fallback, GROUP, GROUP)
+        assert own_socket_path("a") == fallback / "a.sock"
+        assert fallback.stat().st_mode & 0o777 == 0o755
+
+    def test_one_that_somebody_else_made_is_refused(
+        self, fallback: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fallback.mkdir()
+        owner = fallback.stat().st_uid
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+        monkeypatch.setattr(status, "FALLBACK_DIRECTORY", str(fallback))
+        with pytest.raises(StatusError, match=rf"{fallback} belongs to .*XDG_RUNTIME_DIR"):
+            own_socket_path("a")
+
+    def test_one_where_others_may_write_is_refused(self, fallback: Path) -> None:
+        fallback.mkdir()
+        fallback.chmod(0o775)
+        if os.getuid() == 0:
+            os.chown(fallback, GROUP, GROUP)
+        with pytest.raises(StatusError, match=f"chmod go-w {fallback}"):
+            own_socket_path("a")
+
+    def test_a_link_to_one_of_ours_is_refused(self, fallback: Path, tmp_path: Path) -> None:
+        ours = tmp_path / "ours"
+        ours.mkdir(mode=0o700)
+        if os.getuid() == 0:
+            os.chown(ours, GROUP, GROUP)
+        fallback.symlink_to(ours)
+        with pytest.raises(StatusError, match="is no directory"):
+            own_socket_path("a")
+
+
+class TestQuery:
+    def test_nobody_there(self, tmp_path: Path) -> None:
+        with pytest.raises(NoAnswerError, match=r"no bridge answers on .*: No such file"):
+            query(tmp_path / "a.sock")
+
+    def test_one_that_ends_before_it_answers(self, tmp_path: Path) -> None:
+        with listening(tmp_path / "a.sock", answer(b"")), pytest.raises(NoAnswerError, match="it ended"):
+            query(tmp_path / "a.sock")
+
+    @pytest.mark.parametrize(
+        "text",
+        [b"no JSON", b"[1]", b"{}", b'{"counters": 1}', b"[" * 100_000, b"\xff"],
+        ids=["text", "list", "empty", "number", "deep", "binary"],
+    )
+    def test_no_bridge(self, tmp_path: Path, text: bytes) -> None:
+        with listening(tmp_path / "a.sock", answer(text)), pytest.raises(StatusError, match="is no bridge"):
+            query(tmp_path / "a.sock")
+
+    def test_an_answer_without_end_is_not_read_to_the_end(self, tmp_path: Path) -> None:
+        sent = 0
+
+        def flood(connection: socket.socket) -> None:
+            nonlocal sent
+            while sent < 1 << 26:
+                sent += connection.send(b" " * 65536)
+
+        with listening(tmp_path / "a.sock", flood), pytest.raises(StatusError, match="is no bridge"):
+            query(tmp_path / "a.sock")
+        assert sent < 1 << 22
+
+    def test_one_deadline_for_all_of_the_answer(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each byte comes within the time for one, and all of them in a time that nobody waits."""
+        now = 0.0
+        monkeypatch.setattr(status.time, "monotonic", lambda: now)
+
+        def drip(connection: socket.socket) -> None:
+            nonlocal now
+            for _ in range(1000):
+                connection.sendall(b" ")
+                now += 1.0
+
+        with listening(tmp_path / "a.sock", drip), pytest.raises(NoAnswerError, match="within 5 s"):
+            query(tmp_path / "a.sock")
+
+    @pytest.mark.parametrize(
+        ("group", "advice"),
+        [("root", "ask as root"), (status.GROUP, "usermod -aG can-bridge USER"), (None, "ask as")],
+    )
+    def test_no_permission(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group: str | None, advice: str
+    ) -> None:
+        def refuse(_path: Path) -> bytes:
+            raise PermissionError
+
+        def name_of(_gid: int) -> Any:
+            if group is None:
+                raise KeyError
+            return status.grp.struct_group((group, "x", GROUP, []))
+
+        monkeypatch.setattr(status, "_read_answer", refuse)
+        monkeypatch.setattr(status.grp, "getgrgid", name_of)
+        (tmp_path / "a.sock").touch()
+        with pytest.raises(StatusError, match=rf"no permission for .*{advice}") as caught:
+            query(tmp_path / "a.sock")
+        assert ("usermod" in str(caught.value)) == (group == status.GROUP)
+        with pytest.raises(StatusError, match=r"no permission for .*ask as"):
+            query(tmp_path / "none.sock")
