@@ -37,6 +37,7 @@ Baudrate = Annotated[int, Meta(ge=50, le=4_000_000, description="a UART rate fro
 SerialNumber = Annotated[
     str, Meta(pattern="^[!-~]{1,32}$", description="the serial number that the device reports")
 ]
+Firmware = Annotated[Literal["can232"], Meta(description="can232")]
 CriticalLimit = Annotated[int, Meta(ge=2, le=18, description="a number of frames from 2 to 18")]
 ReadyLimit = Annotated[
     int, Meta(ge=1, le=17, description="a number of frames from 1 to 17")
@@ -76,12 +77,17 @@ class _AdapterKeys(Struct, frozen=True, kw_only=True):
     port: Port
     baudrate: Baudrate | None = None
     serial_number: SerialNumber | None = None
+    firmware: Firmware | None = None
     critical_limit: CriticalLimit | None = None
     ready_limit: ReadyLimit | None = None
 
 
 class Can232Config(Struct, frozen=True, kw_only=True):
-    """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s."""
+    """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s.
+
+    `firmware` "can232": what is there is a CAN232 for certain; None: it may be a clone, and is treated so
+    until it has said what it is.
+    """
 
     default_window: ClassVar[int] = 1
     default_restart_s: ClassVar[float] = 0.1
@@ -90,6 +96,7 @@ class Can232Config(Struct, frozen=True, kw_only=True):
     port: Port
     baudrate: Baudrate = 57_600
     serial_number: SerialNumber | None = None
+    firmware: Firmware | None = None
 
 
 class Usb2canConfig(Struct, frozen=True, kw_only=True):
@@ -211,7 +218,10 @@ _KEYS_OF_OTHERS = {
         "critical_limit": "goes with type: usb2can; remove it",
         "ready_limit": "goes with type: usb2can; remove it",
     },
-    "usb2can": {"baudrate": "a FT245 has no baud rate: remove it"},
+    "usb2can": {
+        "baudrate": "a FT245 has no baud rate: remove it",
+        "firmware": "goes with type: can232; remove it",
+    },
 }
 
 _RESERVED_OPTIONS = {

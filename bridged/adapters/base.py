@@ -90,7 +90,10 @@ class Adapter(Protocol):
     polling: Polling | None  # known after init_steps, as is
     flow: Flow | None  # None: the device answers each frame
     discarded: int  # frames that it took and threw away, as far as it tells
-    last_words: bytes  # close the channel, where no time is left to await answers
+
+    @property
+    def last_words(self) -> bytes:
+        """Closes the channel, where no time is left to await answers."""
 
     def init_steps(self, serial_number: str | None) -> Steps:
         """From whatever state to an open channel. Raises AdapterError for a device that will not do.

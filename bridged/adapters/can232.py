@@ -38,12 +38,21 @@ POLL_INTERVAL_S = 0.01
 TRANSMIT_FIFO = 8  # frames (manual 1.3)
 LONGEST_FRAME_BITS = 160  # extended, 8 bytes, as many stuff bits as there can be, the pause behind it
 
-# A command that a crashed program left half typed is in the device's buffer. A CR would finish it: a
+# A command that a crashed program left half typed may be in the device's buffer. A CR would finish it: a
 # frame from another time goes out on a live bus. A "C" might even complete it, being a hex digit. "V"
-# is no hex digit, makes every half command invalid, and alone only asks for the version. As many of
-# them as a line holds: firmware that looks no further than the data it wants (CANable) counts to 30
-# and begins its line anew.
-FLUSH = b"V" * (LONGEST_LINE - 1) + b"\r"
+# is no hex digit, makes a half command invalid, and alone only asks for the version.
+#
+# A CAN232 looks at the whole line, so as many as a line holds are enough, with their CR.
+SHORT_FLUSH = b"V" * (LONGEST_LINE - 1) + b"\r"
+
+# Other firmware may send what such a line begins with, whatever follows. But its buffer overflows, after
+# 30 to 165 characters, and then begins anew (or the line is thrown away). So more than any buffer holds, and
+# no CR before it has overflowed. In pieces that fit into a USB packet (64 bytes) each. What forgets a half
+# command after a silence (10 ms, 50 ms) has forgotten all of it after the pause.
+FLUSH_PIECE = b"V" * 50
+FLUSH_PIECES = 4
+FLUSH_PAUSE_S = 0.06
+IDENTIFY_TRIES = 4  # the first V ends the line of the flush, which a CAN232 refuses
 
 # F, CAN232 manual: bit -> meaning. Bit 4 is not used.
 STATUS_FLAGS = {
@@ -71,7 +80,6 @@ class Can232:
     codec = "can232"
     flow: Flow | None = None
     discarded = 0  # it does not tell
-    last_words = b"C\rC\r"
 
     def __init__(self, adapter: Can232Config, channel: ChannelConfig, memory: Memory) -> None:
         self._port = adapter.port
@@ -79,6 +87,8 @@ class Can232:
         self._wanted_serial = adapter.serial_number
         self._channel = channel
         self._memory = memory
+        self._is_can232 = adapter.firmware == "can232"  # the user says so
+        self._flushed = self._is_can232  # no half command of another program is in the device's buffer
         self._stamped = False
         self.identity = Identity()
         self.polling: Polling | None = None
@@ -104,8 +114,14 @@ class Can232:
     def init_steps(self, serial_number: str | None) -> Steps:  # noqa: ARG002 - it has one of its own (N)
         """Flush, close, identify, configure, open (manual 1.4), then mend what its EEPROM has wrong."""
         self.polling = None
-        yield from self._flush()
+        if self._is_can232:
+            yield from self._flush_can232()
+        else:
+            self._flushed = False
+            yield from self._flush()
         yield from self._identify()
+        if not self._is_can232:
+            yield from self._close()
         yield from self._configure()
         yield from self._open()
         auto_poll = yield from self._auto_poll()
@@ -126,7 +142,11 @@ class Can232:
         C throws away what is in the transmit FIFO, and those frames are answered: to drain it is to wait
         until they are on the bus, if others take up no more than half of it.
         """
-        if drain:
+        if not self._flushed:  # nothing was sent to it yet but a part of the flush
+            yield from self._flush()
+            yield self.sync._replace(accept=ANYTHING, reject=())
+            self._flushed = True
+        elif drain:
             answer = yield self.sync._replace(accept=ANYTHING, reject=())  # answered after all frames
             if answer.reply is TEXT:
                 yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
@@ -135,10 +155,25 @@ class Can232:
         if answer.reply is NONE:
             yield from self._close()
 
+    @property
+    def last_words(self) -> bytes:
+        """Nothing as long as a C might complete somebody's half command."""
+        return b"C\rC\r" if self._flushed else b""
+
     def _flush(self) -> Steps:
+        """For a device of which nothing is known yet. The line is still to be ended, by `V`: a lone CR means
+        different things to different firmware (the last frame once more, the first byte of a command)."""
+        for _ in range(FLUSH_PIECES):
+            on_the_line_s = len(FLUSH_PIECE) * 10 / self.baudrate
+            yield Exchange(
+                FLUSH_PIECE, "drop a half-typed command", (NONE,), (), timeout_s=on_the_line_s
+            )  # whatever answers it is of no interest
+        yield pause(FLUSH_PAUSE_S)
+
+    def _flush_can232(self) -> Steps:
         """Lone CRs, as the manual wants them, only once the channel is closed: on an open one some
         clones answer them by sending their last frame again."""
-        yield self._step(FLUSH, "drop a half-typed command", ANYTHING, (), prefix=b"V")
+        yield self._step(SHORT_FLUSH, "drop a half-typed command", ANYTHING, (), prefix=b"V")
         yield from self._close()
         yield self._step(b"\r\r", "empty its command buffer", ANYTHING, ())
 
@@ -146,8 +181,9 @@ class Can232:
         yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
 
     def _identify(self) -> Steps:
-        for _ in range(3):
+        for _ in range(IDENTIFY_TRIES):
             answer = yield self._step(b"V\r", "tell its version", (TEXT, REFUSED, NONE), (), prefix=b"V")
+            self._flushed = True
             if answer.reply is TEXT:
                 break
         else:

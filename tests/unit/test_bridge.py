@@ -421,8 +421,8 @@ class PairPort:
     failure = None
     serial_number = None
 
-    def __init__(self) -> None:
-        self._near, self.far = socket.socketpair()
+    def __init__(self, kind: int = socket.SOCK_STREAM) -> None:
+        self._near, self.far = socket.socketpair(socket.AF_UNIX, kind)
         self._near.setblocking(False)
         self.far.settimeout(LIMIT_S)
         self.fd = self._near.fileno()
@@ -436,6 +436,21 @@ def lines(port: PairPort) -> Iterator[bytes]:
         for line in port.far.recv(4096).replace(b"\r", b"\r\n").split(b"\n"):
             if line.strip():
                 yield line
+
+
+def test_each_piece_of_the_flush_is_a_write_of_its_own(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it becomes a USB packet of its own; also with a window that lets several commands go at once."""
+    port = PairPort(socket.SOCK_SEQPACKET)
+    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bridge = bench.bridge(transmit="{window: 8}")
+    bridge.start()
+    writes: list[bytes] = []
+    while len(writes) < 5:
+        run_until(bridge, lambda: select.select([port.far], (), (), 0)[0])
+        writes.append(port.far.recv(4096))
+    assert writes == [b"V" * 50] * 4 + [b"V\r"]
+    port.far.close()
+    stopped(bridge)
 
 
 @pytest.mark.parametrize(("last", "state"), [(b"S4\r", State.FAULT), (b"O\r", State.BACKOFF)])

@@ -436,8 +436,8 @@ def test_one_wrong_value(file: Path, section: Callable[[str], str], entry: str, 
     assert problems_of(file, text) == [f"{line + 1}:{column + 1}: {key}: {problem}"]
 
 
-ADAPTER_KEYS = "type, port, baudrate, serial_number, critical_limit, ready_limit"
-CAN232_KEYS = "type, port, baudrate, serial_number"
+ADAPTER_KEYS = "type, port, baudrate, serial_number, firmware, critical_limit, ready_limit"
+CAN232_KEYS = "type, port, baudrate, serial_number, firmware"
 USB2CAN_KEYS = "type, port, serial_number, critical_limit, ready_limit"
 CHANNEL_KEYS = "bitrate, btr0, btr1, sample_point, listen_only, acceptance, restart"
 BUS_KEYS = "interface, channel, create"
