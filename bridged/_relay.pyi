@@ -50,8 +50,11 @@ class Relay:
     ) -> Self: ...
     def run(self) -> None:
         """Relay until stop() is called, without the GIL. OSError(EBUSY): another thread does."""
-    def turn(self, now: int, /) -> int | None:
-        """One turn without waiting at the time `now` (ns); the time of the next one, None: on input."""
+    def turn(self, now: int, wall: int = 0, /) -> int | None:
+        """One turn without waiting; the time of the next one (ns), None: on input. For tests.
+
+        `now`, `wall` (0 to 2**62 ns): what the relay's clock and that of the time stamps show all the while.
+        """
     def stop(self) -> None: ...
     def wake(self) -> None:
         """One turn, for nothing but to see that it turns (counter `turns`)."""

@@ -148,13 +148,27 @@ static PyObject *Relay_run(PyObject *self, PyObject *Py_UNUSED(ignored))
     Py_RETURN_NONE;
 }
 
-static PyObject *Relay_turn(PyObject *self, PyObject *arg)
+/* A time of the tests' clocks: what the relay adds to it, below 1e6 s, must not overflow. */
+static int clock_from(PyObject *number, void *ns)
 {
-    int64_t now = PyLong_AsLongLong(arg);
-    if (now == -1 && PyErr_Occurred())
+    int64_t value = PyLong_AsLongLong(number);
+    if (value == -1 && PyErr_Occurred())
+        return 0;
+    if (value < 0 || value > INT64_C(1) << 62) {
+        PyErr_SetString(PyExc_ValueError, "a time is 0 to 2**62 ns");
+        return 0;
+    }
+    *(int64_t *)ns = value;
+    return 1;
+}
+
+static PyObject *Relay_turn(PyObject *self, PyObject *args)
+{
+    struct moment at = {0};
+    if (!PyArg_ParseTuple(args, "O&|O&:turn", clock_from, &at.boot_ns, clock_from, &at.wall_ns))
         return NULL;
     struct relay *r = relay_lock(self);
-    int64_t next = relay_turn(r, now);
+    int64_t next = relay_turn(r, at);
     pthread_mutex_unlock(&r->lock);
     if (next == NEVER)
         Py_RETURN_NONE;
@@ -381,7 +395,7 @@ static PyObject *Relay_tally(PyObject *self, PyObject *Py_UNUSED(ignored))
 
 static PyMethodDef RELAY_METHODS[] = {
     {"run", Relay_run, METH_NOARGS, NULL},
-    {"turn", Relay_turn, METH_O, NULL},
+    {"turn", Relay_turn, METH_VARARGS, NULL},
     {"stop", Relay_stop, METH_NOARGS, NULL},
     {"wake", Relay_wake, METH_NOARGS, NULL},
     {"fileno", Relay_fileno, METH_NOARGS, NULL},

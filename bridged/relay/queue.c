@@ -48,8 +48,9 @@ void queue_drop(struct relay *r, enum tx_drop reason)
     r->count.tx_dropped[reason]++;
 }
 
-/* Both lists are in order of age, so only their heads need a look. Where the adapter answers frames, nobody knows
- * before a refusal was checked what became of the frame. */
+/* Both lists are in order of age, so only their heads need a look; what a sender's own time stamp puts out of order
+ * send_next() finds. Where the adapter answers frames, nobody knows before a refusal was checked what became of the
+ * frame. */
 void queue_expire(struct relay *r, int64_t now)
 {
     bool certain = flow_used(r) || !(r->checking || r->resyncing);

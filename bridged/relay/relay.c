@@ -16,6 +16,7 @@
 #define RX_RETRY_NS INT64_C(1000000)
 #define DOUBT_QUIET_NS INT64_C(50000000)     /* until a frame counts that nothing has followed yet */
 #define PARTIAL_QUIET_NS INT64_C(1000000000) /* until the beginning of a message counts as noise */
+#define STAMP_MAX_S INT64_C(4102444800)      /* the year 2100 */
 
 #ifndef SYS_epoll_pwait2
 #define SYS_epoll_pwait2 441 /* in Linux 5.11; unknown to older headers */
@@ -24,12 +25,24 @@
 enum source { WAKE = 1, PORT = 2, BUS = 4 };
 enum { SOURCES = 3 };
 
+static int64_t clock_ns(clockid_t clock)
+{
+    struct timespec t;
+    clock_gettime(clock, &t);
+    return t.tv_sec * NS_PER_S + t.tv_nsec;
+}
+
 /* Counts on while the machine is suspended, so that frames grow old in their sleep too. */
 int64_t relay_clock(void)
 {
-    struct timespec t;
-    clock_gettime(CLOCK_BOOTTIME, &t);
-    return t.tv_sec * NS_PER_S + t.tv_nsec;
+    return clock_ns(CLOCK_BOOTTIME);
+}
+
+/* In this order: a process stopped between the two takes its frames for older, never for younger. */
+static struct moment moment_now(void)
+{
+    int64_t boot_ns = relay_clock();
+    return (struct moment){boot_ns, clock_ns(CLOCK_REALTIME)};
 }
 
 /* --- life ------------------------------------------------------------------------------------ */
@@ -293,22 +306,43 @@ static void port_read(struct relay *r, int64_t now)
 
 /* --- bus -> device --------------------------------------------------------------------------- */
 
-/* Age of a frame by the kernel's time stamp, 0 without one. A step of the wall clock can make it
- * wrong either way for the frames in the socket at that moment; never below 0. */
-static int64_t message_age(const struct msghdr *h, int64_t wall_ns)
+/* The kernel's time stamp on the wall clock; -1 if there is none, INT64_MAX for one that no clock shows before 2100. */
+static int64_t message_stamp(const struct msghdr *h)
 {
     for (struct cmsghdr *c = CMSG_FIRSTHDR(h); c; c = CMSG_NXTHDR((struct msghdr *)(uintptr_t)h, c)) {
         if (c->cmsg_level != SOL_SOCKET || c->cmsg_type != SCM_TIMESTAMPNS)
             continue;
         struct timespec t;
         memcpy(&t, CMSG_DATA(c), sizeof t);
-        int64_t age = wall_ns - (t.tv_sec * NS_PER_S + t.tv_nsec);
-        return age > 0 ? age : 0;
+        return t.tv_sec >= 0 && t.tv_sec < STAMP_MAX_S ? t.tv_sec * NS_PER_S + t.tv_nsec : INT64_MAX;
     }
-    return 0;
+    return -1;
 }
 
-static void bus_message(struct relay *r, struct mmsghdr *m, const struct bus_message *b, int64_t wall_ns, int64_t now)
+/* When a frame that was read by `now` was born, on the relay's clock: by its time stamp as far as that can be true.
+ *
+ * The stamp is the wall clock's, which somebody may have set since, or one that the sender made up (SO_TXTIME).
+ * The frame came after the socket was seen empty, and not after `now`: a stamp that says otherwise says nothing, and
+ * the frame counts as old as it can be. `offset` turns the wall clock's time into ours, see clock_offset().
+ * Without a stamp it is as young as can be: no bus of ours has such. */
+static int64_t frame_born(const struct relay *r, const struct msghdr *h, int64_t offset, int64_t now)
+{
+    int64_t stamp = message_stamp(h);
+    if (stamp < 0)
+        return now;
+    int64_t born = stamp == INT64_MAX ? stamp : stamp - offset;
+    return born < r->empty.boot_ns || born > now ? r->empty.boot_ns : born;
+}
+
+/* The wall clock less ours, now or when the socket was seen empty: the one by which frames are older. Where the wall
+ * clock was set in between, nobody knows whether before or after a frame. */
+static int64_t clock_offset(const struct relay *r, struct moment now)
+{
+    int64_t before = r->empty.wall_ns - r->empty.boot_ns, after = now.wall_ns - now.boot_ns;
+    return before > after ? before : after;
+}
+
+static void bus_message(struct relay *r, struct mmsghdr *m, const struct bus_message *b, int64_t offset, int64_t now)
 {
     r->count.bus_read++;
     if (m->msg_len == CANFD_MTU)
@@ -318,36 +352,37 @@ static void bus_message(struct relay *r, struct mmsghdr *m, const struct bus_mes
     else if (b->frame.classic.can_id & CAN_ERR_FLAG)
         queue_drop(r, TX_ERROR_FRAME);
     else
-        queue_add(r, &b->frame.classic, now - message_age(&m->msg_hdr, wall_ns), now);
+        queue_add(r, &b->frame.classic, frame_born(r, &m->msg_hdr, offset, now), now);
 }
 
-/* EINTR, EAGAIN: poll tells when. ENETDOWN: the interface went down; said, the socket stays.
+/* Reads a batch in the turn that began at `turn`. `live`: time has gone on since. -> the time now
+ * EINTR: poll tells when. EAGAIN, or fewer frames than asked for: the socket was empty. ENETDOWN: the interface went
+ * down; said, the socket stays. It may have cut short the batch before, so nothing is known of the socket any more.
  * An empty message is the end of a socketpair. Anything else: the interface is gone. */
-static void bus_read(struct relay *r, int64_t now)
+static int64_t bus_read(struct relay *r, struct moment turn, bool live)
 {
     for (int i = 0; i < BUS_BATCH; i++)
         r->bus_msg[i].msg_hdr.msg_controllen = sizeof r->bus_message[i].control;
     int n = recvmmsg(r->bus, r->bus_msg, BUS_BATCH, MSG_DONTWAIT, NULL);
-    if (n < 0 && (errno == EINTR || errno == EAGAIN))
-        return;
-    if (n < 0 && errno == ENETDOWN) {
+    int error = n < 0 ? errno : 0;
+    const struct moment now = live ? moment_now() : turn;
+    if (error == ENETDOWN) {
+        r->empty = (struct moment){0};
         relay_emit(r, EVENT_BUS_DOWN, 0, NULL, 0);
-        return;
+    } else if (error && error != EINTR && error != EAGAIN) {
+        bus_lost(r, error);
     }
-    if (n < 0) {
-        bus_lost(r, errno);
-        return;
-    }
-    struct timespec t;
-    clock_gettime(CLOCK_REALTIME, &t);
-    int64_t wall_ns = t.tv_sec * NS_PER_S + t.tv_nsec;
+    int64_t offset = clock_offset(r, now);
     for (int i = 0; i < n; i++) {
         if (r->bus_msg[i].msg_len == 0) {
             bus_lost(r, 0);
-            return;
+            break;
         }
-        bus_message(r, &r->bus_msg[i], &r->bus_message[i], wall_ns, now);
+        bus_message(r, &r->bus_msg[i], &r->bus_message[i], offset, now.boot_ns);
     }
+    if (error == EAGAIN || (n >= 0 && n < BUS_BATCH))
+        r->empty = turn;
+    return now.boot_ns;
 }
 
 /* --- attach, detach: lock held --------------------------------------------------------------- */
@@ -387,6 +422,7 @@ void relay_attach_bus(struct relay *r, int fd)
     r->attachments++;
     unwatch(r, r->bus);
     r->bus = fd;
+    r->empty = (struct moment){0}; /* frames may wait in it since the bridge before us: their stamps are believed */
     int error = fd >= 0 ? watch(r, EPOLL_CTL_ADD, fd, BUS, EPOLLIN) : 0;
     if (error)
         bus_lost(r, error);
@@ -425,11 +461,12 @@ static long wait_epoll(int epoll_fd, struct epoll_event ready[SOURCES], int64_t 
     return epoll_wait(epoll_fd, ready, SOURCES, ns == NEVER ? -1 : ms > INT_MAX ? INT_MAX : (int)ms);
 }
 
-/* Waits without the lock until something is there or `until` has come; says which sources are ready. */
-static unsigned int wait_ready(struct relay *r, int64_t now, int64_t until)
+/* Waits without the lock until something is there or `until` has come; says which sources are ready.
+ * `turn`: the time of the turn before: where the bus is not ready, its socket was empty after that. */
+static unsigned int wait_ready(struct relay *r, struct moment turn, int64_t until)
 {
     struct epoll_event ready[SOURCES];
-    int64_t wait_ns = until == NEVER ? NEVER : until > now ? until - now : 0;
+    int64_t wait_ns = until == NEVER ? NEVER : until > turn.boot_ns ? until - turn.boot_ns : 0;
     watch_room(r);
     uint32_t attachments = r->attachments;
     pthread_mutex_unlock(&r->lock);
@@ -445,16 +482,21 @@ static unsigned int wait_ready(struct relay *r, int64_t now, int64_t until)
         ssize_t ignored = read(r->wake_fd, &value, sizeof value);
         (void)ignored;
     }
-    return attachments == r->attachments ? sources : 0;
+    if (attachments != r->attachments)
+        return 0;
+    if (n >= 0 && !(sources & BUS))
+        r->empty = turn;
+    return sources;
 }
 
-/* What has come is handled, what may go is sent. `now` is the time of this turn. */
-static int64_t turn(struct relay *r, unsigned int ready, int64_t now)
+/* What has come is handled, what may go is sent. `at` is the time of this turn; `live`: it goes on meanwhile. */
+static int64_t turn(struct relay *r, unsigned int ready, struct moment at, bool live)
 {
+    int64_t now = at.boot_ns;
     if (ready & PORT && r->port >= 0)
         port_read(r, now);
     if (ready & BUS && r->bus >= 0)
-        bus_read(r, now);
+        now = bus_read(r, at, live);
     if (r->rx_retry_ns <= now)
         rx_flush(r, now);
     if (r->quiet_at_ns <= now)
@@ -464,10 +506,10 @@ static int64_t turn(struct relay *r, unsigned int ready, int64_t now)
     return next_deadline(r);
 }
 
-/* One turn without waiting, at a time of the caller's choice: tests run the relay on their own clock. */
-int64_t relay_turn(struct relay *r, int64_t now)
+/* One turn without waiting, at a time of the caller's choice: tests run the relay on their own clocks. */
+int64_t relay_turn(struct relay *r, struct moment at)
 {
-    return turn(r, wait_ready(r, now, now), now);
+    return turn(r, wait_ready(r, at, at.boot_ns), at, false);
 }
 
 /* Turns until relay_stop. Returns at once with EBUSY if another thread runs it. */
@@ -480,12 +522,12 @@ int relay_run(struct relay *r)
     int result = r->running ? EBUSY : 0;
     if (!result) {
         r->running = true;
-        int64_t now = relay_clock();
-        int64_t until = turn(r, 0, now);
+        struct moment at = moment_now();
+        int64_t until = turn(r, 0, at, true);
         while (!r->stop) {
-            unsigned int ready = wait_ready(r, now, until);
-            now = relay_clock();
-            until = turn(r, ready, now);
+            unsigned int ready = wait_ready(r, at, until);
+            at = moment_now();
+            until = turn(r, ready, at, true);
         }
         r->running = r->stop = false;
     }

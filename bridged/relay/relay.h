@@ -85,6 +85,11 @@ struct event {
     uint8_t text[EVENT_SIZE];
 };
 
+/* Both clocks at one time: the relay's own, that of the kernel's time stamps. */
+struct moment {
+    int64_t boot_ns, wall_ns;
+};
+
 struct settings {
     const struct codec *codec;
     uint32_t queue;
@@ -176,6 +181,7 @@ struct relay {
     } bus_message[BUS_BATCH];
     struct iovec bus_iov[BUS_BATCH];
     struct mmsghdr bus_msg[BUS_BATCH];
+    struct moment empty; /* no frame from before it is in the bus's socket any more; 0: not known yet */
 
     struct event events[EVENTS_MAX];
     uint32_t event_head, event_count;
@@ -187,7 +193,7 @@ struct relay *relay_new(const struct settings *set); /* NULL with errno */
 void relay_free(struct relay *r);
 int64_t relay_clock(void);
 int relay_run(struct relay *r);                    /* takes the lock; -> 0 or errno */
-int64_t relay_turn(struct relay *r, int64_t now); /* lock held; -> next deadline */
+int64_t relay_turn(struct relay *r, struct moment at); /* lock held; -> next deadline */
 void relay_wake(struct relay *r);
 void relay_attach_port(struct relay *r, int fd);
 void relay_detach_port(struct relay *r);

@@ -383,8 +383,13 @@ static bool send_next(struct relay *r, int64_t now)
     if (!frame_ready(r, now))
         return false;
     r->polled = false;
-    r->count.retries += r->retry_count > 0;
-    struct tx_frame tx = r->retry_count ? retry_pop(r) : queue_pop(r);
+    bool again = r->retry_count > 0;
+    struct tx_frame tx = again ? retry_pop(r) : queue_pop(r);
+    if (now - tx.born_ns > r->set.deadline_ns) { /* it stood behind a younger one, where queue_expire() does not look */
+        queue_drop(r, again ? TX_REFUSED : TX_STALE);
+        return true;
+    }
+    r->count.retries += again;
     send_frame(r, &tx, now);
     return true;
 }

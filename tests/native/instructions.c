@@ -87,7 +87,7 @@ static int64_t now = NS_PER_S;
 static void turn(void)
 {
     now += 1000;
-    relay_turn(relay, now);
+    relay_turn(relay, (struct moment){now, now});
 }
 
 static void relay_start(const struct codec *codec)
