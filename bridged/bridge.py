@@ -29,6 +29,7 @@ from bridged.health import BusState
 from bridged.lifecycle import Action, Backoff, Event, State, Told, chance, repeated, transition
 from bridged.polling import NOISE, NOISE_CAUSES, HealthPolling
 from bridged.ports import open_port
+from bridged.ports.sharing import Sharing
 from bridged.ports.watch import Watch
 from bridged.status import LOST_BEFORE_READ
 
@@ -80,6 +81,7 @@ class Bridge:
         # A CAN232's own serial number is not that of a USB device.
         usb = config.adapter.type == "usb2can"
         self._watch = Watch(config.adapter.port, config.adapter.serial_number if usb else None)
+        self._sharing = Sharing()
         self._path = config.adapter.port  # where it was last
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -150,7 +152,8 @@ class Bridge:
             self._dispatch(Event.APPEARED)
 
     def next_timer(self) -> float | None:
-        timers = (self._timer, self._bus_end.next_at, self._polling.next_at, self._exchanges.next_at)
+        parts = (self._bus_end, self._polling, self._exchanges, self._sharing)
+        timers = (self._timer, *(part.next_at for part in parts))
         return min((t for t in timers if t is not None), default=None)
 
     def on_timer(self, now: float) -> None:
@@ -162,6 +165,7 @@ class Bridge:
         self._start_with_bus()
         self._polling.on_timer(now)
         self._exchanges.on_timer(now)
+        self._sharing.on_timer(now)
 
     def has_turned(self) -> bool:
         """Whether the relay has turned since the last call, which gave it cause to; waits if a turn hangs."""
@@ -268,6 +272,8 @@ class Bridge:
 
     def _log_transition(self, reason: str) -> None:
         """One line; retries, and what is repeated too often, for those who look for a fault only."""
+        if self.state in FAILING:
+            self._sharing.suspect(time.monotonic())
         if self._polling.heard_noise() and reason and self.state in FAILING:
             reason += f"; there is {NOISE} ({NOISE_CAUSES})"
         self.reason = reason or (self.reason if self.state in AFTERMATH else "")
@@ -329,6 +335,7 @@ class Bridge:
     def _open_port(self) -> None:
         result: Port | Exception
         try:
+            self._watch.refuse_stranger()
             path = self._watch.path()
             if path not in {self._path, self.config.adapter.port}:
                 log.info("%s has the serial number that is wanted, not %s", path, self.config.adapter.port)
@@ -355,6 +362,8 @@ class Bridge:
             raise result
         self._plugged_in = False
         self._port = result
+        self._watch.opened(result.fd)
+        self._sharing.opened(result.description, time.monotonic())
         self._relay.attach_port(result.fd)
         self._dispatch(Event.OPENED)
 
@@ -396,6 +405,7 @@ class Bridge:
         for kind, token, text in self._relay.events():  # of the port that is no more, or of the bus
             if kind in {_relay.EVENT_BUS_LOST, _relay.EVENT_BUS_DOWN}:
                 self._on_event(kind, token, text)
+        self._sharing.closed()
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -472,11 +482,13 @@ class Bridge:
             self._bus_end.on_lost(token)
         elif kind == _relay.EVENT_NOISE:
             self.adapter.saw_noise(text)
+            self._sharing.suspect(time.monotonic())
         else:
             self._polling.heard(text)
 
     def _on_unanswered(self, resyncs: int) -> None:
         now = time.monotonic()
+        self._sharing.suspect(now)
         if now < self._unanswered_log_at:
             return
         self._unanswered_log_at = now + UNANSWERED_LOG_S

@@ -31,6 +31,8 @@ _BAUDRATE_TOLERANCE: Final = 0.03  # an 8N1 receiver bears about 5 % between bot
 _TCGETS2: Final = 0x802C542A  # asm-generic/ioctls.h: the speed in bit/s, where termios knows named rates only
 _TERMIOS2: Final = struct.Struct("=IIIIB19sII")  # ..., c_ispeed, c_ospeed (asm-generic/termbits.h)
 
+_OWN_TERMINAL: Final = os.makedev(5, 0)  # /dev/tty: another name for the controlling terminal
+
 _INT: Final = struct.Struct("=i")
 _LINGER: Final = struct.Struct("=ii")
 
@@ -45,6 +47,7 @@ _TCP_OPTIONS: Final = (
     (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 10_000),  # ms
 )
 _BLOCK: Final = 4096
+_BACKLOG_MAX: Final = 1_000_000  # bytes of a pumped port that were not read yet: a fast line's of 2 seconds
 
 
 def open_serial(port: str, baudrate: int) -> TtyPort | TcpPort | PumpedPort:
@@ -56,6 +59,8 @@ def open_serial(port: str, baudrate: int) -> TtyPort | TcpPort | PumpedPort:
         return TcpPort(port)
     if baudrate <= 0:
         raise PortError(f"{port}: baudrate {baudrate} must be above 0")
+    if port.startswith("/"):
+        _refuse_terminal(port)
     try:
         # Any: the stub promises serial.Serial whatever the URL.
         device: Any = serial.serial_for_url(port, baudrate=baudrate, exclusive=True, timeout=POLL_INTERVAL_S)
@@ -158,7 +163,11 @@ class PumpedPort(Pump):
         device = self._device
         while not self._stopping.is_set():
             if data := device.read(1):  # returns with the first byte, or after POLL_INTERVAL_S
-                if more := device.in_waiting:
+                if (more := device.in_waiting) > _BACKLOG_MAX:  # pyserial keeps all that comes
+                    raise PortError(
+                        "more than 1 MB waits to be read, no serial line is so fast: wrong server?"
+                    )
+                if more:
                     data += device.read(more)
                 self._far.sendall(data)
 
@@ -168,6 +177,26 @@ class PumpedPort(Pump):
 
     def _release(self) -> None:
         self._device.close()
+
+
+def _refuse_terminal(port: str) -> None:
+    """PortError for the terminal that somebody works at: made raw, and typed at, it would be dead for them.
+
+    It has perhaps just got the number of a simulator's terminal that ended.
+    """
+    try:
+        device = os.stat(port)  # noqa: PTH116 - beside os.open
+    except OSError:
+        return  # opening says why not
+    if not stat.S_ISCHR(device.st_mode):
+        return
+    if device.st_rdev == _OWN_TERMINAL:
+        raise PortError(f"{port}: is the terminal that this program runs in, not an adapter")
+    if users := sysfs.users_as_terminal(device.st_rdev):
+        name = os.path.realpath(port)
+        link = "" if name == port else f" (a link to {name})"
+        hint = "; for a simulator use a name that stays: simulate --link PATH" if "/pts/" in name else ""
+        raise PortError(f"{port}{link}: is the terminal of {users[0]}, not an adapter: not taken{hint}")
 
 
 def _make_raw(fd: int) -> None:

@@ -43,13 +43,79 @@ def latency_ms(tty: Path) -> int | None:
         return None
 
 
-def users(path: Path) -> list[str]:
-    """Which processes have it open, as far as /proc lets us see: `slcand (process 123)`."""
+def users(path: Path, *, others: bool = False) -> list[str]:
+    """Which processes have it open, as far as we may see: `slcand (process 123)`, `bridge pc (process 4)`.
+
+    Without the program that made the pseudo terminal: it is the other end of the line; with `others` also
+    without this process.
+    """
     device = str(path.resolve())
+    own = str(os.getpid()) if others else None
     found = []
     for process in _PROC.glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # not ours, or just ended
-            if any(str(link.readlink()) == device for link in (process / "fd").iterdir()):
-                name = printable((process / "comm").read_text(errors="replace").strip())
-                found.append(f"{name} (process {process.name})")
+        if process.name == own:
+            continue
+        files = _open_files(process)
+        if device in files.values() and not _made_terminal(process, files, device):
+            found.append(_described(process))
     return found
+
+
+def _open_files(process: Path) -> dict[str, str]:
+    """The file behind each descriptor; empty for a process of another user, or one that has just ended."""
+    files = {}
+    folder = f"{process}/fd"
+    with contextlib.suppress(OSError):
+        for fd in os.listdir(folder):  # noqa: PTH208 - as below: thousands of them
+            with contextlib.suppress(OSError):
+                files[fd] = os.readlink(f"{folder}/{fd}")  # noqa: PTH115
+    return files
+
+
+def _made_terminal(process: Path, files: dict[str, str], device: str) -> bool:
+    """Whether one of a process's descriptors is the master of the pseudo terminal /dev/pts/N."""
+    if "/pts/" not in device:
+        return False
+    index = f"tty-index:\t{device.rpartition('/')[2]}"
+    masters = [fd for fd, target in files.items() if target.endswith("/ptmx")]
+    with contextlib.suppress(OSError):
+        return any(index in (process / "fdinfo" / fd).read_text().splitlines() for fd in masters)
+    return False
+
+
+def users_as_terminal(device: int) -> list[str]:
+    """Whose controlling terminal the tty with this device number is; the leader of the session is first."""
+    tty_nr = os.minor(device) & 0xFF | os.major(device) << 8 | (os.minor(device) & ~0xFF) << 12
+    found = []
+    for name in os.listdir(_PROC):  # noqa: PTH208 - each start of a bridge waits for it
+        if not name.isdigit():
+            continue
+        with contextlib.suppress(OSError, ValueError):  # just ended
+            fd = os.open(f"{_PROC}/{name}/stat", os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                stat = os.read(fd, 1024)
+            finally:
+                os.close(fd)
+            # proc_pid_stat(5): pid (comm) state ppid pgrp session tty_nr
+            session, terminal = stat[stat.rindex(b")") + 2 :].split(b" ", 5)[3:5]
+            if int(terminal) & 0xFFFFFFFF == tty_nr:
+                found.append((session != name.encode(), int(name)))
+    return [_described(_PROC / str(number)) for _, number in sorted(found)]
+
+
+def _described(process: Path) -> str:
+    """`slcand (process 123)`; a bridge by its name, where its command line tells it."""
+    try:
+        command = (process / "comm").read_text(errors="replace").strip()
+        arguments = (process / "cmdline").read_text(errors="replace").split("\0")
+    except OSError:
+        return f"process {process.name}"
+    programs = {Path(argument).name for argument in arguments[:4]}
+    if "run" in arguments and programs & {"can-bridge", "bridged"}:
+        options = iter(arguments[arguments.index("run") + 1 :])
+        for argument in options:
+            if argument == "--socket":
+                next(options, None)
+            elif argument and not argument.startswith("-"):
+                return f"bridge {printable(Path(argument).stem)} (process {process.name})"
+    return f"{printable(command)} (process {process.name})"

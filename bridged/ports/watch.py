@@ -11,6 +11,7 @@ import struct
 from pathlib import Path
 from typing import Final
 
+from bridged.errors import PortError
 from bridged.ports import sysfs
 
 _SYS: Final = Path("/sys")
@@ -43,6 +44,8 @@ class Watch:
         self._port = port
         self._usb_serial_number = usb_serial_number
         self._usb = _USB_URL.fullmatch(port)
+        self._is_numbered = is_numbered_terminal(port)
+        self._terminal: tuple[int, int] | None = None  # the numbered one that was opened
         self._socket: socket.socket | None = None
         if self._usb or "://" not in port:
             with contextlib.suppress(OSError):
@@ -77,6 +80,8 @@ class Watch:
             return self._has_usb_device()
         if "://" in self._port:
             return True
+        if self._is_stranger():
+            return False
         try:
             os.stat(self.path())  # noqa: PTH116 - exists() does not tell why not
         except PermissionError:  # opening says so
@@ -97,6 +102,30 @@ class Watch:
         if not ttys or Path(self._port).resolve().name in ttys:
             return self._port
         return str(_DEV / ttys[0])
+
+    def opened(self, fd: int) -> None:
+        """The port was opened as `fd`: a numbered terminal is known by it from now on."""
+        if self._is_numbered and self._terminal is None:
+            self._terminal = _identity(os.fstat(fd))
+
+    def refuse_stranger(self) -> None:
+        """PortError if /dev/pts/N is not the terminal any more that was opened first.
+
+        The kernel gives the number of one that has ended to the next that is made: somebody's shell.
+        """
+        if self._is_stranger():
+            raise PortError(
+                f"{self._port}: this terminal has ended; the next one with its number may be anybody's and "
+                "is not taken: use a name that stays, as of simulate --link PATH, or start the bridge again"
+            )
+
+    def _is_stranger(self) -> bool:
+        if self._terminal is None:
+            return False
+        try:
+            return _identity(os.stat(self._port)) != self._terminal  # noqa: PTH116 - as above
+        except OSError:
+            return True
 
     def _is_ours(self, event: dict[str, str]) -> bool:
         if event.get("ACTION") != "add":
@@ -139,6 +168,16 @@ class Watch:
                     break
                 some_lost = some_lost or error.errno == errno.ENOBUFS
         return events, some_lost
+
+
+def is_numbered_terminal(port: str) -> bool:
+    """Whether it is /dev/pts/N itself, and no link to it: a name that the kernel uses again and again."""
+    return re.fullmatch(r"/dev/pts/\d+", os.path.normpath(port)) is not None
+
+
+def _identity(terminal: os.stat_result) -> tuple[int, int]:
+    """Differs between two pseudo terminals of one number: the kernel makes the inode with each."""
+    return terminal.st_rdev, terminal.st_ctime_ns
 
 
 def _read(file: Path) -> str:

@@ -1,7 +1,10 @@
 """An adapter that is plugged in, and opened in the middle of that."""
 
 import contextlib
+import os
+import pty
 import socket
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,3 +52,31 @@ def test_one_more_try_at_once(bench: Bench, monkeypatch: pytest.MonkeyPatch, fai
         run_until(bridge, lambda: len(tries) == 2 and bridge.state is end)
         stopped(bridge)
     assert len(tries) == 2
+
+
+def test_a_numbered_terminal_is_not_taken_again(bench: Bench) -> None:
+    """Once the simulator has ended, the next terminal of its number is somebody's shell."""
+    bench.plug_in(Can232(time.monotonic()))
+    bench.link = bench.link.resolve()
+    bridge = started(bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.01}"))
+    bench.pull_out()
+    run_until(bridge, lambda: bridge.state is State.WAITING)
+    assert "use a name that stays" in bridge.reason
+    with contextlib.ExitStack() as stack:
+        name = ""
+        while name != str(bench.link):
+            master, slave = pty.openpty()
+            stack.callback(os.close, master)
+            stack.callback(os.close, slave)
+            name = os.ttyname(slave)
+        before = termios.tcgetattr(slave)
+        looks = []
+        is_there = bridge._watch.is_there
+        bridge._watch.is_there = lambda: looks.append(0) or is_there()  # type: ignore[func-returns-value, method-assign]
+        run_until(bridge, lambda: len(looks) > 3)
+        assert bridge.state is State.WAITING
+        assert termios.tcgetattr(slave) == before
+        os.set_blocking(master, False)
+        with pytest.raises(BlockingIOError):  # nothing was typed at it
+            os.read(master, 1)
+    stopped(bridge)

@@ -10,6 +10,7 @@ import pwd
 import select
 import shutil
 import socket
+import subprocess
 import termios
 import threading
 import time
@@ -22,7 +23,7 @@ import serial
 from serial import rfc2217
 
 from bridged.errors import PortError
-from bridged.ports import open_port
+from bridged.ports import open_port, sysfs
 from bridged.ports import serial as ports
 
 if TYPE_CHECKING:
@@ -55,6 +56,23 @@ def pty_pair() -> Iterator[tuple[int, str]]:
     yield master, path
     with contextlib.suppress(OSError):
         os.close(master)
+
+
+@contextlib.contextmanager
+def terminal_session(path: str) -> Iterator[tuple[int, int]]:
+    """A descriptor of the terminal, and the process whose controlling terminal it is, as of a shell."""
+    slave = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    command = "echo; exec sleep 60"
+    with subprocess.Popen(
+        ["setsid", "--ctty", "sh", "-c", command], stdin=slave, stdout=subprocess.PIPE
+    ) as shell:
+        try:
+            assert shell.stdout
+            assert shell.stdout.readline()  # it has it now
+            yield slave, shell.pid
+        finally:
+            shell.kill()
+            os.close(slave)
 
 
 class TestTty:
@@ -192,13 +210,39 @@ class TestTtyErrors:
         with pytest.raises(PortError, match="a link to /dev/pts/nothing, which does not exist"):
             open_port(str(tmp_path / "link"), 57600)
 
-    def test_second_open_is_refused_and_names_the_first(self, pty_pair: tuple[int, str]) -> None:
+    def test_second_open_is_refused_and_names_the_first(
+        self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         port = open_port(pty_pair[1], 57600)
+        monkeypatch.setattr(sysfs, "_made_terminal", lambda *_: False)  # it is this process
         name = f"in use by .* .process {os.getpid()}."
         with pytest.raises(PortError, match=name):
             open_port(pty_pair[1], 57600)
         port.close()
         open_port(pty_pair[1], 57600).close()
+
+    @pytest.mark.parametrize("by_link", [False, True])
+    def test_somebody_s_terminal_is_not_taken(
+        self, pty_pair: tuple[int, str], tmp_path: Path, by_link: bool
+    ) -> None:
+        """Neither opened, which would make it raw and type at it, nor locked."""
+        path = pty_pair[1]
+        link = tmp_path / "can232"
+        link.symlink_to(path)
+        with terminal_session(path) as (slave, shell):
+            before = termios.tcgetattr(slave)
+            before[3] |= termios.ICANON | termios.ECHO | termios.ISIG
+            termios.tcsetattr(slave, termios.TCSANOW, before)
+            before = termios.tcgetattr(slave)
+            said = rf"{f'a link to {path}' if by_link else path}\)?: is the terminal of .* .process {shell}."
+            with pytest.raises(PortError, match=rf"{said}.*not taken.*simulate --link"):
+                open_port(str(link) if by_link else path, 57600)
+            assert termios.tcgetattr(slave) == before
+        open_port(path, 57600).close()  # nobody's any more
+
+    def test_the_own_terminal_is_not_taken(self) -> None:
+        with pytest.raises(PortError, match="/dev/tty: is the terminal that this program runs in"):
+            open_port("/dev/tty", 57600)
 
     def test_program_that_excludes_others(
         self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
@@ -208,6 +252,7 @@ class TestTtyErrors:
         def busy(*_: object, **__: object) -> int:
             raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
 
+        monkeypatch.setattr(sysfs, "users_as_terminal", lambda _: [])
         monkeypatch.setattr(os, "open", busy)
         with pytest.raises(PortError, match="in use by another program"):
             open_port(pty_pair[1], 57600)
@@ -427,6 +472,32 @@ class TestRfc2217:
         start = time.monotonic()
         port.close()
         assert time.monotonic() - start < 15.0  # it does not hang; how fast it is, is no matter for a test
+
+    def test_a_flood_ends_it_before_the_memory(self) -> None:
+        class Flooding:
+            """What pyserial's rfc2217:// is when its server sends faster than bytes come out of its queue."""
+
+            in_waiting = 0
+
+            def read(self, size: int) -> bytes:
+                self.in_waiting = 2 * self.in_waiting + 1000
+                return bytes(size)
+
+            def close(self) -> None:
+                self.closed = True
+
+        device = Flooding()
+        port = ports.PumpedPort("rfc2217://h:1", device)
+        received = 0
+        while True:
+            wait_readable(port.fd)
+            if not (data := os.read(port.fd, 1 << 20)):
+                break
+            received += len(data)
+        assert received < 1_100_000
+        assert str(port.failure).startswith("rfc2217://h:1: more than 1 MB waits to be read")
+        port.close()
+        assert device.closed
 
     def test_notices_dead_peers(self, server: SerialServer) -> None:
         port = open_port(url("rfc2217", server.listener), 57600)

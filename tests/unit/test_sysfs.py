@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,40 @@ def test_users(tmp_path: Path) -> None:
     assert sysfs.users(file) == []
     with file.open("rb"):
         assert [user.endswith(f"(process {os.getpid()})") for user in sysfs.users(file)] == [True]
+
+
+def test_users_of_a_terminal() -> None:
+    """Whoever has made it is its other end, and no other user."""
+    master, slave = os.openpty()
+    path = Path(os.ttyname(slave))
+    assert sysfs.users(path) == []
+    with subprocess.Popen(["cat"], stdin=slave, stdout=subprocess.DEVNULL) as cat:
+        try:
+            assert sysfs.users(path) == [f"cat (process {cat.pid})"]
+        finally:
+            cat.kill()
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (
+            "/usr/bin/python3 /usr/bin/can-bridge run --socket /run/x.sock /etc/can-bridge/pc.yaml",
+            "bridge pc",
+        ),
+        ("/usr/bin/python3 -m bridged run pc --verbose", "bridge pc"),
+        ("/usr/bin/python3 /usr/bin/can-bridge simulate can232", "can-bridge"),
+        ("vi can-bridge run", "can-bridge"),
+    ],
+)
+def test_a_bridge_is_named(tmp_path: Path, command: str, name: str) -> None:
+    process = tmp_path / "12"
+    process.mkdir()
+    (process / "comm").write_text("can-bridge\n")
+    (process / "cmdline").write_text(command.replace(" ", "\0") + "\0")
+    assert sysfs._described(process) == f"{name} (process 12)"
 
 
 def test_ports_that_are_no_usb_devices() -> None:
