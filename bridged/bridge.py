@@ -11,7 +11,6 @@ import errno
 import logging
 import os
 import queue
-import re
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -90,8 +89,7 @@ class Bridge:
         self._starts = 0  # how often it began to run
         self._identity: object = None  # that was told
         self._bus_off = BusOff(config, self.adapter, self._dispatch)
-        self._unanswered_log_at = 0.0
-        self._unanswered_told = Told()
+        self._unanswered_told = Told(UNANSWERED_LOG_S)
         self._turns: object = None  # of the relay, when they were looked at last
         sync = self.adapter.sync
         self._relay = _relay.Relay(
@@ -130,7 +128,7 @@ class Bridge:
 
     def stop(self) -> None:
         """Closes the adapter, then everything; `finished` says when."""
-        self._bus_end.next_at = None
+        self._bus_end.retry_at = None
         self._dispatch(Event.STOP)
 
     def filenos(self) -> tuple[int, ...]:
@@ -206,8 +204,9 @@ class Bridge:
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""
+        lost = self._bus_end.lost_frames()  # before the relay's, so that each of them is in those
         counters: dict[str, Any] = self._relay.counters()
-        for reason, n in self._bus_end.lost_frames().items():
+        for reason, n in lost.items():
             if reason in LOST_BEFORE_READ:
                 counters["tx_dropped"][reason] = n
             else:  # the relay took it for delivered
@@ -244,7 +243,7 @@ class Bridge:
                 "reconnects": max(0, self._starts - 1),
                 "bus_off_restarts": health.restarts,
                 **health.happened,
-                **self._bus_end.error_frames,
+                **self._bus_end.error_frames(),
                 "tx_discarded": self.adapter.discarded,
                 **counters,
             },
@@ -277,8 +276,7 @@ class Bridge:
         if self._polling.heard_noise() and reason and self.state in FAILING:
             reason += f"; there is {NOISE} ({NOISE_CAUSES})"
         self.reason = reason or (self.reason if self.state in AFTERMATH else "")
-        cause = re.sub(r"\d+", "#", reason)  # counts differ from time to time
-        times = self._told.tell(cause, time.monotonic()) if reason else None
+        times = self._told.tell(reason, time.monotonic()) if reason else None
         if times is not None:
             log.warning("state=%s: %s%s", self.state.value, reason, repeated(times))
             return
@@ -489,13 +487,10 @@ class Bridge:
     def _on_unanswered(self, resyncs: int) -> None:
         now = time.monotonic()
         self._sharing.suspect(now)
-        if now < self._unanswered_log_at:
-            return
-        self._unanswered_log_at = now + UNANSWERED_LOG_S
         times = self._unanswered_told.tell("unanswered", now)
         self._unanswered_told.well()
         if times is not None:
-            log.warning("an answer of the adapter is missing: resynchronising (resyncs=%d)", resyncs)
+            log.warning("no answer from the adapter: resynchronising (resyncs=%d)", resyncs)
 
     def _on_stuck(self, frames: int) -> None:
         if self.state is State.RUNNING:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import errno
 import logging
+import math
 import os
 import time
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from bridged.buses import LOST_ERROR_FRAMES
 from bridged.errors import BusError
+from bridged.health import ErrorFrameLimit
 from bridged.lifecycle import Told, repeated
 
 if TYPE_CHECKING:
@@ -33,13 +36,14 @@ class BusEnd:
     def __init__(self, config: Config, relay: _relay.Relay, open_bus: Callable[[], Bus]) -> None:
         self.bus: Bus | None = None
         self.reason = ""  # why it is not open, or carries nothing
-        self.next_at: float | None = None
-        self.error_frames = Counter(error_frames=0, error_frames_lost=0)
+        self.retry_at: float | None = None  # the interface is looked for again then
+        self._limit = ErrorFrameLimit()
+        self._error_frames = Counter(error_frames=0, error_frames_lost=0)
         self._config = config
         self._relay = relay
         self._open_bus = open_bus
         self._told = Told()
-        self._lost_before: Counter[str] = Counter()  # frames, on buses that were closed since
+        self._dropped_before: Counter[str] = Counter()  # on buses that were closed since
 
     def open(self) -> None:
         """Opens it, or tries again later."""
@@ -47,7 +51,7 @@ class BusEnd:
             bus = self._open_bus()
         except BusError as error:
             self._fails(logging.ERROR, f"bus not open: {error}")
-            self.next_at = time.monotonic() + RETRY_S
+            self.retry_at = time.monotonic() + RETRY_S
             return
         self._is_well(f"bus open: {bus.description}")
         self.use(bus)
@@ -63,11 +67,18 @@ class BusEnd:
         """Other settings, but for the interface."""
         self._config = config
 
+    @property
+    def next_at(self) -> float | None:
+        """When on_timer() is to be called."""
+        return min((at for at in (self.retry_at, self._limit.next_at) if at is not None), default=None)
+
     def on_timer(self, now: float) -> bool:
         """Whether the interface has come up, or back."""
-        if self.next_at is None or now < self.next_at:
+        if self._limit.next_at is not None and self._limit.next_at <= now:
+            self._put(self._limit.take(now))
+        if self.retry_at is None or now < self.retry_at:
             return False
-        self.next_at = None
+        self.retry_at = None
         if self.bus is None:
             self.open()
         else:
@@ -82,35 +93,55 @@ class BusEnd:
         hint = f" (was {self._config.bus.channel} deleted?)" if error in {errno.ENODEV, errno.ENXIO} else ""
         self._fails(logging.ERROR, f"bus lost: {self.bus.description}: {cause}{hint}; opening it again")
         self.close()
-        self.next_at = time.monotonic()
+        self.retry_at = time.monotonic()
 
     def on_down(self, warning: str = "") -> None:
         """The relay says so. The kernel does not tell when it is up again: that is looked for."""
-        if self.bus is None or self.next_at is not None:
+        if self.bus is None or self.retry_at is not None:
             return
         channel = self._config.bus.channel
         self._fails(logging.WARNING, warning or f"interface {channel} is down: ip link set {channel} up")
-        self.next_at = time.monotonic() + RETRY_S
+        self.retry_at = time.monotonic() + RETRY_S
 
     def lost_frames(self) -> Counter[str]:
         """Between the relay and the interface, by reason."""
-        return self._lost_before + Counter(self.bus.dropped() if self.bus else {})
+        lost = self._dropped()
+        del lost[LOST_ERROR_FRAMES]
+        return lost
+
+    def error_frames(self) -> dict[str, int]:
+        """How many are on the interface, and how many it would not have."""
+        lost = self._dropped()[LOST_ERROR_FRAMES]
+        return {
+            "error_frames": self._error_frames["error_frames"] - lost,
+            "error_frames_lost": self._error_frames["error_frames_lost"] + lost,
+            "error_frames_left_out": self._limit.left_out,
+        }
+
+    def _put(self, frames: list[bytes]) -> None:
+        if self.bus is None:
+            return
+        for frame in frames:
+            try:
+                os.write(self.bus.fd, frame)
+            except OSError:  # down, full, or gone: the relay notices by itself
+                self._error_frames["error_frames_lost"] += 1
+            else:
+                self._error_frames["error_frames"] += 1
+
+    def _dropped(self) -> Counter[str]:
+        return self._dropped_before + Counter(self.bus.dropped() if self.bus else {})
 
     def put_error_frame(self, frame: bytes) -> None:
-        """What the bus of the adapter suffers, as a CAN error frame on ours."""
-        if not self._config.health.error_frames or self.bus is None:
-            return
-        try:
-            os.write(self.bus.fd, frame)
-        except OSError:  # down, full, or gone: the relay notices by itself
-            self.error_frames["error_frames_lost"] += 1
-        else:
-            self.error_frames["error_frames"] += 1
+        """What the bus of the adapter suffers, as a CAN error frame on ours; soon, if there are many."""
+        if self._config.health.error_frames and self.bus is not None:
+            self._put(self._limit.add(frame, time.monotonic()))
 
     def hand_over(self) -> Bus | None:
         """The open bus, for a successor's use(); None: there is none, or it is down, which open() tells."""
         if self.bus is None or self.reason:
             return None
+        self._put(self._limit.take(math.inf))
         self._relay.detach_bus()
         bus, self.bus = self.bus, None
         return bus
@@ -119,8 +150,9 @@ class BusEnd:
         """Idempotent."""
         if self.bus is None:
             return
+        self._put(self._limit.take(math.inf))
         self._relay.detach_bus()
-        self._lost_before = self.lost_frames()
+        self._dropped_before = self._dropped()
         self.bus.close()
         self.bus = None
 
@@ -131,7 +163,7 @@ class BusEnd:
         if is_up(channel):
             self._is_well(f"interface {channel} is up again")
         else:
-            self.next_at = time.monotonic() + RETRY_S
+            self.retry_at = time.monotonic() + RETRY_S
 
     def _fails(self, level: int, reason: str) -> None:
         self.reason = reason

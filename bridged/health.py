@@ -9,6 +9,7 @@ as new as Linux 6.0, and can-utils of before (Debian 12's) refuse to decode a fr
 from __future__ import annotations
 
 import enum
+import math
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,6 +31,8 @@ CRTL_RX_WARNING, CRTL_TX_WARNING, CRTL_RX_PASSIVE, CRTL_TX_PASSIVE = 0x04, 0x08,
 LARGEST_BUFFER = 64
 """Frames. More than a CAN232 (8) or any clone has room for."""
 STALL_LOOKS = 3
+
+ERROR_FRAME_INTERVAL_S = 0.01
 
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame
 
@@ -178,6 +181,46 @@ class Stall:
         self._looks += 1
         lasts = self._looks >= STALL_LOOKS and now_s - self._since_s >= self.limit_s
         return lasts and tx_frames > self._tx_left
+
+
+class ErrorFrameLimit:
+    """Error frames for the interface, one of state and one of anything else in ERROR_FRAME_INTERVAL_S.
+
+    Those that come sooner wait until `next_at`: of states the last one, of the others one that says all that
+    they say. Times are seconds of any clock.
+    """
+
+    def __init__(self) -> None:
+        self.next_at: float | None = None
+        self.left_out = 0
+        self._waiting: dict[bool, bytes] = {}  # by whether it is one of state
+        self._free_at = dict.fromkeys((False, True), -math.inf)
+
+    def add(self, frame: bytes, now: float) -> list[bytes]:
+        """Those that may go now."""
+        is_state = _is_state(frame)
+        before = self._waiting.get(is_state)
+        if before is not None:
+            self.left_out += 1
+            if not is_state:
+                frame = bytes(a | b for a, b in zip(before, frame, strict=True))
+        self._waiting[is_state] = frame
+        return self.take(now)
+
+    def take(self, now: float) -> list[bytes]:
+        """Those that may go now; with math.inf all."""
+        frames = []
+        for is_state in (False, True):  # a restart before the state after it
+            if is_state in self._waiting and now >= self._free_at[is_state]:
+                frames.append(self._waiting.pop(is_state))
+                self._free_at[is_state] = now + ERROR_FRAME_INTERVAL_S
+        self.next_at = min((self._free_at[is_state] for is_state in self._waiting), default=None)
+        return frames
+
+
+def _is_state(frame: bytes) -> bool:
+    can_id, _, data = _FRAME.unpack(frame)
+    return bool(can_id & CAN_ERR_BUSOFF or data[1] & ~CRTL_RX_OVERFLOW)
 
 
 def _notice(happened: Happened) -> bytes | None:

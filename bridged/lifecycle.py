@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import os
+import re
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -13,6 +14,7 @@ STABLE_S: Final = 60.0  # the adapter ran so long: what failed before is forgott
 JITTER: Final = 0.2  # a pause is shorter by up to this part, so that many bridges do not try in step
 REPEAT_LOG_S: Final = 3600.0  # the same cause is told again
 TOLD_AT_MOST: Final = 5  # the same cause within that time
+CAUSES_MAX: Final = 32  # what an adapter says may be anything; causes beyond these are told as one
 
 
 class State(enum.Enum):
@@ -195,35 +197,46 @@ class Backoff:
 
 class _Cause:
     def __init__(self, told_at: float, left: int) -> None:
-        self.told_at = told_at
+        self.told_at = told_at  # for the first time
+        self.told_last_at = told_at
         self.left = left  # how often it may be told until REPEAT_LOG_S have passed
         self.untold = 0  # how often it came without being told
         self.again = False  # all was well since: it is news
 
 
 class Told:
-    """Which causes are in the log: each is told once until all is well again, and not too often then."""
+    """Limits repeated log lines: each cause once until all is well again, at most 5 times an hour.
 
-    def __init__(self) -> None:
+    Texts that differ only in their digits are one cause. `interval_s`: so long at least between two lines of
+    the same cause.
+    """
+
+    def __init__(self, interval_s: float = 0.0) -> None:
         self.failing = False  # something came since all was well
         self.quiet = False  # and nothing was told since
+        self._interval_s = interval_s
         self._causes: dict[str, _Cause] = {}
 
     def tell(self, cause: str, now: float) -> int | None:
         """How often it came since it was told, this time included; None: not to be told this time."""
         self.failing = True
+        cause = re.sub(r"\d+", "#", cause)  # counts differ from time to time
         known = self._causes.get(cause)
+        if known is None and len(self._causes) >= CAUSES_MAX:
+            # Twice as long, so that one which comes back now and then is told with its count.
+            for text in [text for text, c in self._causes.items() if now - c.told_at >= 2 * REPEAT_LOG_S]:
+                del self._causes[text]
+            if len(self._causes) >= CAUSES_MAX:
+                cause = ""
+                known = self._causes.get(cause)
         if known is not None and now - known.told_at < REPEAT_LOG_S:
-            if not (known.again and known.left):
+            if not (known.again and known.left) or now - known.told_last_at < self._interval_s:
                 known.untold += 1
                 return None
             known.left -= 1
             known.again = False
+            known.told_last_at = now
         else:
-            # Twice as long, so that one which comes back now and then is told with its count.
-            self._causes = {
-                text: entry for text, entry in self._causes.items() if now - entry.told_at < 2 * REPEAT_LOG_S
-            }
             self._causes[cause] = _Cause(now, TOLD_AT_MOST - 1)
         self.quiet = False
         times = 1 + (known.untold if known else 0)

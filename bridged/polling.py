@@ -74,8 +74,7 @@ class HealthPolling:
         self.full_at = -math.inf  # when it said last that its transmit buffer was full
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
-        self._warned_at: dict[str, float] = {}
-        self._warned = Told()
+        self._warned = Told(LOG_INTERVAL_S)
         self._told = Told()  # of bus states
 
     def start(self, now: float, *, restarted: bool = False) -> None:
@@ -238,12 +237,7 @@ class HealthPolling:
 
     def _warn(self, pattern: str, text: str) -> None:
         """Each text once in LOG_INTERVAL_S, and not too often in an hour."""
-        now = time.monotonic()
-        if now - self._warned_at.get(pattern % text, -LOG_INTERVAL_S) < LOG_INTERVAL_S:
-            return
-        self._warned_at = {known: at for known, at in self._warned_at.items() if now - at < LOG_INTERVAL_S}
-        self._warned_at[pattern % text] = now
-        times = self._warned.tell(pattern % text, now)
-        self._warned.well()
+        times = self._warned.tell(pattern % text, time.monotonic())
+        self._warned.well()  # what comes again is news, if it does not come all the time
         if times is not None:
             log.warning(f"{pattern}%s", text, repeated(times))

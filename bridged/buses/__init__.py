@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from bridged.errors import BridgeError
+
+LOST_ERROR_FRAMES: Final = "bus-error-frame"
+"""The reason in Bus.dropped() for error frames of ours: they are no frames of the adapter's."""
 
 
 class Bus(Protocol):

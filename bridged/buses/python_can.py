@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import can
 
+from bridged.buses import LOST_ERROR_FRAMES
 from bridged.buses.socketcan import receive_stamped, set_buffers
 from bridged.errors import BusError
 from bridged.pump import POLL_INTERVAL_S, Pump
@@ -44,7 +45,6 @@ _ECHO: Final = frozenset({"udp_multicast"})
 _OVERFLOW: Final = "bus-pump-overflow"  # bus -> device: the relay did not keep up
 _RECV_FAILED: Final = "bus-recv-failed"  # bus -> device: the driver could not make a message of it
 _SEND_FAILED: Final = "bus-send-failed"  # device -> bus: the driver refused, or its queue stayed full
-_NO_ERROR_FRAMES: Final = "bus-error-frame"  # device -> bus: this interface carries no error frames
 
 _log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class PythonCanBus(Pump):
         self._bus = bus
         self._carries_error_frames = interface in _CARRY_ERROR_FRAMES
         self._sender = f"can-bridge {uuid.uuid4()}" if interface in _ECHO else None
-        self._dropped = dict.fromkeys((_OVERFLOW, _RECV_FAILED, _SEND_FAILED, _NO_ERROR_FRAMES), 0)
+        self._dropped = dict.fromkeys((_OVERFLOW, _RECV_FAILED, _SEND_FAILED, LOST_ERROR_FRAMES), 0)
         set_buffers(self._near)
         set_buffers(self._far)
         receive_stamped(self._near)
@@ -113,14 +113,14 @@ class PythonCanBus(Pump):
         while packet := receive(_CANFD_FRAME.size):
             message = unpack_frame(packet)
             if message.is_error_frame and not self._carries_error_frames:
-                self._drop(_NO_ERROR_FRAMES)
+                self._dropped[LOST_ERROR_FRAMES] += 1  # by design, so not worth a log line
                 continue
             if sender:
                 message.channel = sender
             try:
                 send(message, POLL_INTERVAL_S)
             except Exception as error:  # noqa: BLE001 - as above; a dead bus is noticed by the other thread
-                self._drop(_SEND_FAILED, error)
+                self._drop(LOST_ERROR_FRAMES if message.is_error_frame else _SEND_FAILED, error)
 
     def _release(self) -> None:
         self._bus.shutdown()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import can
 import pytest
 from test_bridge import FRAME, Bench, run_until, started, stopped
 from test_bridge_usb2can import Usb2canBench
@@ -13,6 +14,7 @@ from test_bridge_usb2can import Usb2canBench
 from bridged import bridge as bridge_module
 from bridged.adapters.base import Steps
 from bridged.bridge import Bridge
+from bridged.buses.python_can import PythonCanBus
 from bridged.health import CAN_ERR_RESTARTED, BusState, error_frame
 from bridged.lifecycle import Event, State
 from bridged.simulators.can232 import Can232
@@ -64,6 +66,22 @@ def heals(bench: Bench, bridge: Bridge, device: Can232, born: list[float]) -> No
     assert all(born[frame.can_id - OLD] > oldest for frame in before)
     assert error_frame(CAN_ERR_RESTARTED) in frames_on_bus(bench)
     assert status["counters"]["bus_off_restarts"] == status["counters"]["reconnects"] >= 1
+
+
+def test_an_interface_without_error_frames_makes_no_counter_negative(
+    can232: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bridge's own error frames are no frames of the adapter's, wherever they end."""
+    bus = PythonCanBus("pcan", "x", can.Bus(interface="virtual", channel=str(can232.folder)))
+    monkeypatch.setattr(bridge_module, "open_bus", lambda *_args, **_options: bus)
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge())
+    device.set_bus_off(time.monotonic(), True)
+    run_until(bridge, lambda: bridge.snapshot()["counters"]["error_frames_lost"])
+    counters = stopped(bridge)["counters"]
+    assert (counters["error_frames"], counters["rx_frames"]) == (0, 0)
+    assert sum(counters["rx_dropped"].values()) == 0
 
 
 def test_a_can232_that_refuses_everything_is_restarted(can232: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -17,13 +18,14 @@ from bridged.bus_end import RETRY_S, BusEnd
 from bridged.buses import socketcan
 from bridged.config import load
 from bridged.errors import BusError
+from bridged.health import CAN_ERR_BUSERROR, CAN_ERR_CRTL, CAN_ERR_LOSTARB, error_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from bridged import _relay
 
-FRAME = bytes(16)
+FRAME = error_frame(CAN_ERR_BUSERROR)
 DOWN = "interface vcan0 is down: ip link set vcan0 up"
 
 
@@ -74,8 +76,8 @@ class Bench:
 
     def pass_time(self, seconds: float) -> None:
         end = self.now + seconds
-        while self.end.next_at is not None and self.end.next_at <= end:
-            self.now = max(self.now, self.end.next_at)
+        while (at := self.end.next_at) is not None and at <= end:
+            self.now = max(self.now, at)
             self.end.on_timer(self.now)
         self.now = end
 
@@ -91,6 +93,16 @@ def bench(
     for bus in made.buses:
         bus.close()
         bus.far.close()
+
+
+def received(bench: Bench) -> list[bytes]:
+    """What others on the interface have got."""
+    frames = []
+    bench.buses[0].far.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while frame := bench.buses[0].far.recv(64):
+            frames.append(frame)
+    return frames
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -174,8 +186,36 @@ def test_error_frames_are_counted(bench: Bench) -> None:
     end.put_error_frame(FRAME)
     assert bench.buses[0].far.recv(64) == FRAME
     bench.buses[0].far.close()
+    bench.pass_time(1.0)
     end.put_error_frame(FRAME)
-    assert end.error_frames == {"error_frames": 1, "error_frames_lost": 1}
+    assert end.error_frames() == {"error_frames": 1, "error_frames_lost": 1, "error_frames_left_out": 0}
+
+
+def test_a_flood_of_error_frames_is_limited_and_its_last_state_always_told(bench: Bench) -> None:
+    """One of state and one of anything else in 10 ms."""
+    end = bench.end
+    end.open()
+    for tec in range(10_000):
+        end.put_error_frame(error_frame(CAN_ERR_CRTL, crtl=0x08, tec=tec % 250))
+        end.put_error_frame(error_frame(CAN_ERR_LOSTARB if tec % 2 else CAN_ERR_BUSERROR))
+        bench.pass_time(0.0001)
+    bench.pass_time(1.0)
+    frames = received(bench)
+    assert 198 <= len(frames) <= 204
+    states = [frame for frame in frames if frame[9]]
+    assert states[0] == error_frame(CAN_ERR_CRTL, crtl=0x08, tec=0)
+    assert states[-1] == error_frame(CAN_ERR_CRTL, crtl=0x08, tec=9_999 % 250)
+    assert error_frame(CAN_ERR_LOSTARB | CAN_ERR_BUSERROR) in frames  # nothing that happened is missing
+    assert end.error_frames()["error_frames_left_out"] == 20_000 - len(frames)
+    assert end.next_at is None
+
+
+def test_an_error_frame_that_waits_is_told_before_the_interface_is_closed(bench: Bench) -> None:
+    bench.end.open()
+    for tec in (1, 2, 3):
+        bench.end.put_error_frame(error_frame(CAN_ERR_CRTL, crtl=0x08, tec=tec))
+    bench.end.hand_over()
+    assert [frame[14] for frame in received(bench)] == [1, 3]
 
 
 def test_handed_over(bench: Bench) -> None:

@@ -18,7 +18,7 @@ import can
 import pytest
 from can.interfaces import virtual
 
-from bridged.buses import open_bus, python_can, socketcan
+from bridged.buses import LOST_ERROR_FRAMES, open_bus, python_can, socketcan
 from bridged.buses.python_can import PythonCanBus, pack_message, unpack_frame
 from bridged.errors import BusError
 
@@ -314,7 +314,7 @@ class TestFaults:
         os.write(bus.fd, frame(0x40))
         wait_until_sent(bus)
         assert [message.is_error_frame for message in driver.sent] == [False]
-        assert bus.dropped() == {"bus-error-frame": 1}
+        assert bus.dropped() == {LOST_ERROR_FRAMES: 1}
         bus.close()
 
     def test_echoes_of_the_driver_are_left_out(self) -> None:

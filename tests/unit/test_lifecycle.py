@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import string
 
 import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from bridged.lifecycle import (
+    CAUSES_MAX,
     IGNORED,
     JITTER,
     REPEAT_LOG_S,
@@ -137,11 +139,23 @@ def test_what_lasts_is_told_again_and_how_often_it_came() -> None:
     assert [n for n in times if n] == [1, per_time, per_time]
 
 
-def test_what_was_told_long_ago_is_forgotten() -> None:
+def test_causes_are_not_told_apart_by_numbers_and_their_number_is_bounded() -> None:
     told = Told()
-    for n in range(1000):
-        told.tell(f"process {n}", n * 100)
-    assert len(told._causes) <= 2 * REPEAT_LOG_S / 100 + 1
+    assert [told.tell(f"TEC {n}", 0) for n in range(3)] == [1, None, None]
+    texts = [f"{a}{b}" for a in string.ascii_letters for b in string.ascii_letters]
+    assert sum(told.tell(text, 1) is not None for text in texts) == CAUSES_MAX
+    assert len(told._causes) == CAUSES_MAX + 1
+    assert told.tell("all others are forgotten by then", 3 * REPEAT_LOG_S) == 1
+    assert len(told._causes) == 1
+
+
+def test_an_interval_between_two_lines_of_a_cause() -> None:
+    told = Told(interval_s=10.0)
+    times = []
+    for now in (0, 5, 9, 10, 19, 20):
+        times.append(told.tell("noise", now))
+        told.well()
+    assert times == [1, None, None, 3, None, 2]
 
 
 # --- the whole, in simulated time -------------------------------------------------------------
