@@ -1,1 +1,3 @@
 """can-bridge: serial CAN adapters as Linux CAN interfaces."""
+
+VERSION = "0.1.0"

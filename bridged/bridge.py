@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from bridged import _relay
 from bridged.adapters import make_adapter
+from bridged.adapters.base import Reply
 from bridged.bus_end import BusEnd
 from bridged.bus_off import BusOff, stuck_s
 from bridged.buses import open_bus
@@ -71,6 +72,8 @@ class Bridge:
         self.reason = ""  # why the state is not running
         self._told = Told()
         self.finished = False
+        # Whether the adapter's channel may be open, as far as its answers tell; None: it was never asked.
+        self.channel_open: bool | None = None
         self.adapter = make_adapter(config, memory)
         self._started = time.monotonic()
         self._port: Port | None = None
@@ -219,6 +222,7 @@ class Bridge:
             "name": self.config.name,
             "state": self.state.value,
             "reason": self.condition()[1],
+            "channel_open": self.channel_open,
             "bus_state": health.state.text if health.state is not None else None,
             "tec": health.tec,
             "rec": health.rec,
@@ -264,6 +268,8 @@ class Bridge:
     def _dispatch(self, event: Event, reason: str = "") -> None:
         before = self.state
         self.state, actions = transition(before, event)
+        if event is Event.CLOSED:
+            self.channel_open = self._exchanges.last_reply is Reply.NONE
         if self.state is not before:
             self._log_transition(reason)
         for action in actions:
@@ -298,6 +304,7 @@ class Bridge:
                 threading.Thread(target=self._open_port, name="open", daemon=True).start()
             case Action.INITIALISE:
                 assert self._port is not None
+                self.channel_open = True
                 self._exchanges.run(self.adapter.init_steps(self._port.serial_number), Event.READY)
             case Action.RUN:
                 self._run()

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import gc
+import io
 import logging
 import os
+import signal
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bridged import VERSION
 from bridged.errors import BridgeError, ConfigError
+from bridged.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,6 +28,8 @@ WATCH_INTERVAL_S = 1.0
 EXIT_NOT_RUNNING = 3  # as systemctl status
 CONFIG_DIRECTORY = Path("/etc/can-bridge")
 HELP_WIDTH = 98
+OUTPUT_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+CANNOT_WRITE = "cannot write to the standard output: {}"
 
 
 def config_path(name: str) -> Path:
@@ -59,11 +66,17 @@ def _run(args: argparse.Namespace) -> int:
     from bridged.memory import FileMemory, state_directory  # noqa: PLC0415
     from bridged.notify import systemd_notifier  # noqa: PLC0415
     from bridged.service import Service, hangup_means_reload  # noqa: PLC0415
-    from bridged.status import StatusServer, own_socket_path, render  # noqa: PLC0415
+    from bridged.status import StatusServer, farewell, own_socket_path  # noqa: PLC0415
 
     config = _load(args.config)
     notifier = systemd_notifier()
     fields = start_logging(config.name, verbose=args.verbose)
+    log = logging.getLogger(__name__)
+    adapter, bus = config.adapter, config.bus
+    log.info(
+        "can-bridge %s: %s: %s on %s to %s %s",
+        VERSION, config.path, adapter.type, adapter.port, bus.interface, bus.channel,
+    )  # fmt: skip
     memory = FileMemory(state_directory())
 
     def successor(present: Config) -> Bridge | None:
@@ -71,18 +84,19 @@ def _run(args: argparse.Namespace) -> int:
         return None if fresh == present else Bridge(fresh, memory)
 
     def snapshot() -> dict[str, Any]:
-        return service.bridge.snapshot()  # of the present one
+        return {"version": VERSION, **service.bridge.snapshot()}  # of the present one
 
     service = Service(Bridge(config, memory), notifier, successor if hangup_means_reload() else None)
     fields.state = lambda: service.bridge.state.value
     status = StatusServer(args.socket or own_socket_path(config.name), snapshot)
     gc.freeze()  # what is loaded stays
     gc.enable()
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # after run(): one that comes late does not spoil a good end
     try:
         service.run(status)
     finally:
         status.close()
-    logging.getLogger(__name__).info("%s", render(snapshot()).replace("\n ", ";"))
+    log.info("%s", farewell(snapshot()))
     return 0
 
 
@@ -98,38 +112,113 @@ def _check(args: argparse.Namespace) -> int:
     return 0
 
 
-def _status_path(args: argparse.Namespace) -> Path:
-    from bridged.status import StatusError, running_sockets, runtime_directory  # noqa: PLC0415
+def _status_paths(args: argparse.Namespace) -> list[Path]:
+    """The status sockets to ask; NotRunningError: there is none."""
+    from bridged.status import NotRunningError, running_sockets  # noqa: PLC0415
 
     if args.socket:
-        return Path(args.socket)
+        return [Path(args.socket)]
     running = running_sockets()
-    if args.name:
-        name = config_path(args.name).stem
-        return next((path for path in running if path.stem == name), runtime_directory() / f"{name}.sock")
-    if len(running) == 1:
-        return running[0]
-    names = ", ".join(path.stem for path in running)
-    raise StatusError(
-        f"several bridges are running, name one: {names}" if running else "no bridge is running"
-    )
+    if not args.name:
+        if not running:
+            raise NotRunningError(f"no bridge is running{_seen()}: start one with `can-bridge run NAME`")
+        return running
+    name = config_path(args.name).stem
+    found = [path for path in running if path.stem == name]
+    if not found:
+        raise NotRunningError(_not_running(args.name))
+    return found[:1]
+
+
+def _seen() -> str:
+    return "" if os.geteuid() == 0 else " (but for other users' bridges, which only they can see)"
+
+
+def _not_running(name: str) -> str:
+    """What to do about the bridge NAME that does not run."""
+    path = config_path(name)
+    if not os.path.isfile(path):  # noqa: PTH113 - False, whatever the name
+        return f"{path.stem} is not running{_seen()}, and there is no {path}"
+    start = f"`can-bridge run {name}`"
+    if path.parent == CONFIG_DIRECTORY:
+        start += f" or `systemctl start can-bridge@{path.stem}`"
+    return f"{path.stem} is not running{_seen()}: start it with {start}"
+
+
+def _ask(args: argparse.Namespace) -> tuple[str, bool]:
+    """What to show, and whether all bridges that were asked run."""
+    import json  # noqa: PLC0415
+
+    from bridged.status import NotRunningError, StatusError, is_running, query, render, render_short  # noqa: PLC0415
+
+    paths = _status_paths(args)
+    if len(paths) == 1:
+        try:
+            status = query(paths[0])
+        except NotRunningError as error:
+            if args.socket:
+                raise
+            raise NotRunningError(_not_running(args.name or paths[0].stem)) from error
+        text = json.dumps(status, indent=None if args.watch else 2) if args.json else render(status)
+        return text, is_running(status)
+    lines, all_run = [], True
+    for path in paths:
+        try:
+            status = query(path)
+            lines.append(json.dumps(status) if args.json else render_short(status))
+            all_run = all_run and is_running(status)
+        except StatusError as error:
+            all_run = False
+            if args.json:
+                _complain(f"{path.stem}: {error}")
+            else:
+                lines.append(printable(f"{path.stem}: {error}"))
+    return "\n".join(lines), all_run
 
 
 def _status(args: argparse.Namespace) -> int:
-    import json  # noqa: PLC0415
+    if args.watch:
+        return _watch(args)
+    text, all_run = _ask(args)
+    print(text)
+    return 0 if all_run else EXIT_NOT_RUNNING
 
-    from bridged.status import query, render  # noqa: PLC0415
 
-    path = _status_path(args)
-    clear = "\x1b[H\x1b[J" if args.watch and not args.json and sys.stdout.isatty() else ""
+def _watch(args: argparse.Namespace) -> int:
+    """Until Ctrl-C; a bridge that is not there, or does not answer, is waited for."""
+    from bridged.status import NoAnswerError  # noqa: PLC0415
+
+    screen = not args.json and sys.stdout.isatty()
+    missed = ""
     while True:
-        status = query(path)
-        text = json.dumps(status, indent=None if args.watch else 2) if args.json else render(status)
-        print(f"{clear}{text}", flush=True)
-        if not args.watch:
-            break
+        try:
+            text, _ = _ask(args)
+            missed = ""
+        except NoAnswerError as error:
+            text = "" if args.json else f"{printable(str(error))}; waiting for it"
+            if args.json and str(error) != missed:
+                _complain(f"{error}; waiting for it")
+                missed = str(error)
+        if screen:
+            print(f"\x1b[H\x1b[J{_fitted(text)}", flush=True)
+        elif text:
+            print(text, flush=True)
         time.sleep(WATCH_INTERVAL_S)
-    return 0 if status["state"] == "running" and status["bus"]["open"] else EXIT_NOT_RUNNING
+
+
+def _fitted(text: str) -> str:
+    """Cut to the terminal's size: a line that wraps, or one too many, would push the state out of it."""
+    try:
+        columns, rows = os.get_terminal_size(sys.stdout.fileno())
+    except OSError:
+        return text
+    if not columns or not rows:  # a serial console
+        return text
+    return "\n".join(line[:columns] for line in text.splitlines()[: max(1, rows - 1)])
+
+
+def _complain(text: str) -> None:
+    print(f"can-bridge: {printable(text)}", file=sys.stderr)
 
 
 def _parser(command: str | None) -> argparse.ArgumentParser:
@@ -142,6 +231,7 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "can-bridge", description="Serial CAN adapters as Linux CAN interfaces.", formatter_class=formatter
     )
+    parser.add_argument("--version", action="version", version=f"can-bridge {VERSION}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, text: str, run: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
@@ -153,21 +243,40 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
     run.add_argument(
         "config", metavar="FILE|NAME", help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml"
     )
-    run.add_argument("--socket", type=Path, metavar="PATH", help="where the status socket is made")
     run.add_argument(
-        "--verbose", action="store_true", help="log what is only of interest when looking for a fault"
+        "--socket",
+        type=Path,
+        metavar="PATH",
+        help="where the status socket is made; default: /run/can-bridge/NAME.sock for root, "
+        "$XDG_RUNTIME_DIR/can-bridge/NAME.sock for others",
     )
+    run.add_argument("--verbose", action="store_true", help="log details (debugging)")
 
     check = add("check", "Check a configuration; exit status 78 if it is not good.", _check)
     check.add_argument("config", metavar="FILE|NAME")
 
     status = add(
-        "status", "Show the state and the counters of a running bridge; exit status 0 if it runs.", _status
+        "status",
+        "Show the state and the counters of running bridges; exit status 0 if all of them run, 3 if not.",
+        _status,
     )
-    status.add_argument("name", nargs="?", metavar="NAME", help="stem of the configuration's file name")
+    status.add_argument(
+        "name",
+        nargs="?",
+        metavar="NAME",
+        help=f"as in {CONFIG_DIRECTORY}/NAME.yaml; without it all bridges that run, several with a line each",
+    )
     status.add_argument("--socket", metavar="PATH", help="the status socket, if not at its usual place")
-    status.add_argument("--json", action="store_true")
-    status.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
+    status.add_argument(
+        "--json",
+        action="store_true",
+        help="print JSON, for programs: an object for each bridge, in one line if there are several",
+    )
+    status.add_argument(
+        "--watch",
+        action="store_true",
+        help="again each second, until Ctrl-C; a bridge that does not run is waited for",
+    )
 
     simulate = add(
         "simulate", "Simulate an adapter on a pseudo terminal, or on a line that is there.", _simulate
@@ -201,17 +310,73 @@ def _demo(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Exit status: 0 done, 1 failed, 3 the bridge is not running, 78 bad configuration."""
-    arguments = sys.argv[1:] if argv is None else argv
-    args = _parser(arguments[0] if arguments else None).parse_args(arguments)
+    _mend_standard_streams()
     try:
+        status = _perform(sys.argv[1:] if argv is None else argv)
+    except SystemExit:  # argparse has said what it is asked for, or what is wrong
+        if _flush():
+            raise
+        return 1
+    return status if _flush() else 1
+
+
+def _perform(arguments: list[str]) -> int:
+    command = arguments[0] if arguments else None
+    try:
+        args = _parser(command).parse_args(arguments)
         return int(args.run(args))
     except ConfigError as error:
-        print(error, file=sys.stderr)
+        for problem in error.problems:
+            print(printable(problem), file=sys.stderr)
         return EX_CONFIG
     except BridgeError as error:
-        print(f"can-bridge: {error}", file=sys.stderr)
-        return EXIT_NOT_RUNNING if args.command == "status" else 1
+        _complain(str(error))
+        return EXIT_NOT_RUNNING if command == "status" else 1
     except BrokenPipeError:
+        return 1
+    except OSError as error:
+        if command == "run" or error.errno not in OUTPUT_FULL or error.filename is not None:  # a bug
+            raise
+        _lead_nowhere(1)
+        _complain(CANNOT_WRITE.format(error.strerror))
         return 1
     except KeyboardInterrupt:  # before the handlers were there
         return 130
+
+
+def _mend_standard_streams() -> None:
+    """Those that are closed lead nowhere, or the adapter's port might get the number of one of them.
+
+    What the locale's encoding does not have is written as an escape, never a reason to fail.
+    """
+    for fd in (0, 1, 2):
+        try:
+            os.fstat(fd)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
+    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _flush() -> bool:
+    """Whether all that was printed is written: here it can be told, in the interpreter's end it cannot."""
+    written = True
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        written = False
+        _lead_nowhere(1)
+        if not isinstance(error, BrokenPipeError):  # who does not read on has seen enough
+            _complain(CANNOT_WRITE.format(error.strerror))
+    try:
+        sys.stderr.flush()
+    except OSError:
+        _lead_nowhere(2)
+    return written
+
+
+def _lead_nowhere(fd: int) -> None:
+    """What waits in the stream's buffer is written there at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), fd)

@@ -37,6 +37,7 @@ class Exchanges:
         self._pending: dict[int, Callable[[Answer], None]] = {}
         self._steps: Steps | None = None
         self._end = Event.CLOSED
+        self.last_reply = Reply.NONE  # to a step of a procedure
         self.next_at: float | None = None  # the end of a pause between two steps, time.monotonic()
 
     @property
@@ -99,6 +100,7 @@ class Exchanges:
             self.ask(exchange, lambda reply: self._on_step_answer(exchange, reply))
 
     def _on_step_answer(self, exchange: Exchange, answer: Answer) -> None:
+        self.last_reply = answer.reply
         if answer.reply in exchange.accept:
             self._advance(answer)
             return

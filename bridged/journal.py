@@ -8,6 +8,8 @@ import select
 import sys
 from typing import TYPE_CHECKING, Any
 
+from bridged.text import printable
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -52,8 +54,16 @@ class StderrHandler(logging.StreamHandler[Any]):
         """Nobody is left to be told."""
 
 
-class PrefixFormatter(logging.Formatter):
-    """Each line with its priority: the journal reads stderr line by line."""
+class LineFormatter(logging.Formatter):
+    """One line for each message: a device's words must not look like a line of ours, or move the cursor."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        record.message = printable(record.message)
+        return super().formatMessage(record)
+
+
+class PrefixFormatter(LineFormatter):
+    """Each line, also of a traceback, with its priority: the journal reads stderr line by line."""
 
     def format(self, record: logging.LogRecord) -> str:
         prefix = _PREFIXES.get(record.levelno, "<2>")
@@ -62,6 +72,7 @@ class PrefixFormatter(logging.Formatter):
 
 def start_logging(name: str, *, verbose: bool) -> Fields:
     """Set the root logger up for the bridge `name`."""
+    name = printable(name)
     fields = Fields(name)
     handler = _make_handler(name)
     handler.addFilter(fields)
@@ -70,9 +81,10 @@ def start_logging(name: str, *, verbose: bool) -> Fields:
 
 
 def _make_handler(name: str) -> logging.Handler:
+    name = name.replace("%", "%%")
     handler: logging.Handler = StderrHandler()
     if not _stderr_is_journal():
-        handler.setFormatter(logging.Formatter(f"%(asctime)s %(levelname)-7s {name}: %(message)s"))
+        handler.setFormatter(LineFormatter(f"%(asctime)s %(levelname)-7s {name}: %(message)s"))
         return handler
     try:
         from systemd.journal import JournalHandler  # noqa: PLC0415 - an extra
@@ -80,7 +92,7 @@ def _make_handler(name: str) -> logging.Handler:
         handler.setFormatter(PrefixFormatter(f"{name}: %(message)s"))
     else:
         handler = JournalHandler(SYSLOG_IDENTIFIER="can-bridge")
-        handler.setFormatter(logging.Formatter(f"{name}: %(message)s"))
+        handler.setFormatter(LineFormatter(f"{name}: %(message)s"))
     return handler
 
 

@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from bridged.errors import ConfigError
+from bridged.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -50,7 +51,7 @@ class Notifier:
         """The line that `systemctl status` shows; sent when it changes."""
         if text != self._status:
             self._status = text
-            self._notify(f"STATUS={' '.join(text.splitlines())}")
+            self._notify(f"STATUS={printable(text)}")
 
     def _notify(self, message: str) -> None:
         if self._send is None:

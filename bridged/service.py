@@ -28,6 +28,7 @@ Handler = Callable[[], None]
 # The bridge that is to take the place of one with this configuration; None: nothing has changed. ConfigError.
 Successor = Callable[["Config"], "Bridge | None"]
 
+PIPE_SIZE = 1 << 16  # all that fits into the pipe of the signals
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
@@ -46,17 +47,19 @@ def hangup_means_reload() -> bool:
 
 
 @contextlib.contextmanager
-def _signals() -> Iterator[int]:
-    """A descriptor that becomes readable when one of SIGNALS comes; ends a select() at once."""
+def _signals() -> Iterator[tuple[int, set[int]]]:
+    """A descriptor that becomes readable when one of SIGNALS comes, which ends a select() at once; and a set
+    that it is put in, since the number does not get into a pipe that many signals have filled."""
     reader, writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    came: set[int] = set()
 
-    def nothing(_number: int, _frame: FrameType | None) -> None:
-        """The number comes through the pipe."""
+    def note(number: int, _frame: FrameType | None) -> None:
+        came.add(number)
 
-    before = {number: signal.signal(number, nothing) for number in SIGNALS}
+    before = {number: signal.signal(number, note) for number in SIGNALS}
     descriptor = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     try:
-        yield reader
+        yield reader, came
     finally:
         signal.set_wakeup_fd(descriptor)
         for number, handler in before.items():
@@ -94,7 +97,7 @@ class Service:
     def run(self, status: StatusServer | None = None) -> None:
         """Runs until a signal has stopped it and the adapter is closed."""
         with _signals() as signals, selectors.DefaultSelector() as selector:
-            selector.register(signals, selectors.EVENT_READ, lambda: self._on_signals(signals))
+            selector.register(signals[0], selectors.EVENT_READ, lambda: self._on_signals(*signals))
             if status is not None:
                 selector.register(status, selectors.EVENT_READ, status.on_readable)
             self._watch(selector)
@@ -130,12 +133,16 @@ class Service:
 
     # --- signals ------------------------------------------------------------------------------
 
-    def _on_signals(self, fd: int) -> None:
-        for number in os.read(fd, 64):
-            if number == signal.SIGHUP and self._make_successor is not None:
-                self._reload(self._make_successor)
-            else:
-                self._stop(signal.Signals(number).name)
+    def _on_signals(self, fd: int, came: set[int]) -> None:
+        """All that came, each once however often it came; a stop leaves nothing to reload."""
+        numbers = set(os.read(fd, PIPE_SIZE))
+        while came:
+            numbers.add(came.pop())
+        stops = numbers if self._make_successor is None else numbers - {signal.SIGHUP}
+        if stops:
+            self._stop(signal.Signals(min(stops)).name)
+        elif self._make_successor is not None:
+            self._reload(self._make_successor)
 
     def _stop(self, name: str) -> None:
         log.info("%s: stopping", name)
@@ -221,7 +228,7 @@ def _describe(bridge: Bridge, state: State, reason: str, *, bus_open: bool) -> s
     if state in {State.STOPPING, State.STOPPED}:
         return "stopping"
     if not bus_open:
-        return f"bus not open: {reason}"
+        return reason or "opening the CAN interface"
     if state is State.RUNNING:
         identity = bridge.adapter.identity
         words = [adapter.type.upper(), identity.version or "", identity.serial_number or ""]

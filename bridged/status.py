@@ -1,6 +1,7 @@
 """The status of a running bridge over a local socket: one JSON object for each connection.
 
-name, state, reason, bus_state, tec, rec (None: not known), rates {rx_fps, tx_fps: frames a second},
+version (of can-bridge), name, state, reason, channel_open (None: the adapter was never asked; true also where
+it did not say), bus_state, tec, rec (None: not known), rates {rx_fps, tx_fps: frames a second},
 answer_time_ms {min, median, max: of the adapter's last answers to questions about its bus},
 adapter {type, port, version, serial_number}, bus {interface, channel, open},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bridged.errors import BridgeError
+from bridged.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -47,7 +49,11 @@ class StatusError(BridgeError):
 
 
 class NoAnswerError(StatusError):
-    """No bridge runs behind the status socket, or it does not answer."""
+    """The bridge behind the status socket does not answer."""
+
+
+class NotRunningError(NoAnswerError):
+    """There is none."""
 
 
 def runtime_directory() -> Path:
@@ -63,7 +69,7 @@ def own_socket_path(name: str) -> Path:
     """Where this user's bridge `name` makes its status socket; the directory is made if it is missing.
 
     StatusError: somebody else owns the directory or may write in it (anybody can make the one in /tmp first),
-    and could put another socket in the place of ours. Root's lies in /run, which only root can write in.
+    and could put another socket in the place of ours.
     """
     directory = runtime_directory()
     try:
@@ -71,24 +77,28 @@ def own_socket_path(name: str) -> Path:
         found = directory.lstat()
     except OSError as error:
         raise StatusError(_cannot_make(directory / f"{name}.sock", error)) from error
-    if os.geteuid() != 0:
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
-            whose = (
-                "is no directory"
-                if not stat.S_ISDIR(found.st_mode)
-                else f"belongs to {user_name(found.st_uid)}"
-            )
-            msg = f"{directory} {whose}: remove it, set XDG_RUNTIME_DIR, or give --socket PATH"
-            raise StatusError(msg)
-        if found.st_mode & OTHERS_WRITE:
-            msg = f"other users may write in {directory}: chmod go-w {directory}, or give --socket PATH"
-            raise StatusError(msg)
+    if distrust := _distrust(found):
+        raise StatusError(f"{directory} {distrust}: set XDG_RUNTIME_DIR, or give --socket PATH")
     return directory / f"{name}.sock"
+
+
+def _distrust(directory: os.stat_result) -> str:
+    """Why our sockets must not be in the directory; empty: they may."""
+    if os.geteuid() == 0:  # it is in /run, where only root may write
+        return ""
+    if not stat.S_ISDIR(directory.st_mode):
+        return "is no directory"
+    if directory.st_uid != os.geteuid():
+        return f"belongs to {user_name(directory.st_uid)}"
+    return "is one that other users may write in" if directory.st_mode & OTHERS_WRITE else ""
 
 
 def running_sockets() -> list[Path]:
     """The status sockets there are, of this user's bridges and of root's."""
-    folders = {runtime_directory(), SYSTEM_DIRECTORY}
+    folders = {SYSTEM_DIRECTORY}
+    with contextlib.suppress(OSError):
+        if not _distrust(runtime_directory().lstat()):
+            folders.add(runtime_directory())
     return sorted(path for folder in folders for path in folder.glob("*.sock"))
 
 
@@ -215,7 +225,7 @@ def query(path: Path) -> dict[str, Any]:
         raise NoAnswerError(msg) from error
     except OSError as error:
         msg = f"no bridge answers on {path}: {error.strerror or error}"
-        raise NoAnswerError(msg) from error
+        raise NotRunningError(msg) from error
     except (ValueError, RecursionError):
         status = None
     if not isinstance(status, dict) or not isinstance(status.get("counters"), dict):
@@ -267,36 +277,107 @@ def user_name(uid: int) -> str:
         return f"user {uid}"
 
 
-def _reasons(dropped: dict[str, int]) -> str:
-    return ", ".join(f"{reason} {n}" for reason, n in dropped.items() if n) or "none"
-
-
-def _bus_state(status: dict[str, Any]) -> str:
-    counters = "" if status["tec"] is None else f", TEC {status['tec']}, REC {status['rec']}"
-    times = status["answer_time_ms"]
-    answers = f", answers in {times['median']:.1f} ms" if times else ""
-    return f"{status['bus_state'] or 'not known'}{counters}{answers}"
+def is_running(status: dict[str, Any]) -> bool:
+    """Whether frames go between the adapter and an open interface."""
+    bus = status.get("bus")
+    return status.get("state") == "running" and isinstance(bus, dict) and bool(bus.get("open"))
 
 
 def render(status: dict[str, Any]) -> str:
-    """The status for a human."""
+    """The status for a human; the state is in the first line, for small terminals."""
+    return _written(_lines, status)
+
+
+def render_short(status: dict[str, Any]) -> str:
+    """The status in one line."""
+    return _written(_short, status)
+
+
+def farewell(status: dict[str, Any]) -> str:
+    """What a bridge has done, for the last line of its log."""
+    return _written(_farewell, status)
+
+
+def _written(write: Callable[[dict[str, Any]], list[str]], status: dict[str, Any]) -> str:
+    """As one writes it, without what moves a terminal's cursor."""
+    try:
+        lines = write(status)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        msg = "the bridge that answers is of another version of can-bridge: restart it, or use --json"
+        raise StatusError(msg) from error
+    return "\n".join(printable(line) for line in lines)
+
+
+def _headline(status: dict[str, Any]) -> str:
+    return f"{status['name']}: {status['state']}, up {_duration(status['uptime_s'])}"
+
+
+def _lines(status: dict[str, Any]) -> list[str]:
     adapter, counters, bus, rates = status["adapter"], status["counters"], status["bus"], status["rates"]
-    reason = f" ({status['reason']})" if status["reason"] else ""
     identity = f"version {adapter['version'] or '?'}, serial number {adapter['serial_number'] or '?'}"
-    to_bus = (
-        f"{counters['rx_frames']} frames, {rates['rx_fps']:.0f}/s, "
-        f"{counters['rx_errors']} errors on the line, {counters['rx_overruns']} overruns of the adapter"
-    )
-    to_adapter = (
-        f"{counters['tx_frames']} frames, {rates['tx_fps']:.0f}/s, {counters['tx_retries']} retries, "
-        f"{status['queued']} queued"
-    )
-    lines = {
+    parts = {
         "adapter": f"{adapter['type']} on {adapter['port']}, {identity}",
         "CAN bus": _bus_state(status),
         "interface": f"{bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
-        "to bus": f"{to_bus}\n  dropped     {_reasons(counters['rx_dropped'])}",
-        "to adapter": f"{to_adapter}\n  dropped     {_reasons(counters['tx_dropped'])}",
+        "received": (
+            f"{counters['rx_frames']} frames from the adapter, {rates['rx_fps']:.0f}/s, "
+            f"{counters['rx_errors']} line errors, {counters['rx_overruns']} adapter overruns"
+        ),
+        "rx dropped": _reasons(counters["rx_dropped"]) or "none",
+        "sent": (
+            f"{counters['tx_frames']} frames to the adapter, {rates['tx_fps']:.0f}/s, "
+            f"{counters['tx_retries']} retries, {status['queued']} queued"
+        ),
+        "tx dropped": _reasons(counters["tx_dropped"]) or "none",
+        "can-bridge": f"version {status['version']}",
     }
-    head = f"{status['name']}: {status['state']}{reason}, up {status['uptime_s']:.0f} s"
-    return "\n".join([head, *(f"  {name:<10}  {text}" for name, text in lines.items())])
+    if status["reason"]:
+        parts = {"reason": status["reason"], **parts}
+    return [_headline(status), *(f"  {name:<10}  {text}" for name, text in parts.items())]
+
+
+def _short(status: dict[str, Any]) -> list[str]:
+    counters = status["counters"]
+    dropped = sum(counters["rx_dropped"].values()) + sum(counters["tx_dropped"].values())
+    reason = f" ({status['reason']})" if status["reason"] else ""
+    return [
+        f"{_headline(status)}, {counters['rx_frames']} frames received, {counters['tx_frames']} sent, "
+        f"{dropped} dropped{reason}"
+    ]
+
+
+def _farewell(status: dict[str, Any]) -> list[str]:
+    counters = status["counters"]
+    rx, tx = _reasons(counters["rx_dropped"]), _reasons(counters["tx_dropped"])
+    dropped = "; ".join([f"rx dropped: {rx}"] * bool(rx) + [f"tx dropped: {tx}"] * bool(tx))
+    channel = {None: "was never opened", False: "is closed", True: "may still be open"}
+    return [
+        f"stopped after {_duration(status['uptime_s'])}: {counters['rx_frames']} frames received, "
+        f"{counters['tx_frames']} sent; {dropped or 'none dropped'}; "
+        f"the adapter's channel {channel[status['channel_open']]}"
+    ]
+
+
+def _reasons(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{reason} {n}" for reason, n in dropped.items() if n)
+
+
+def _bus_state(status: dict[str, Any]) -> str:
+    if status["bus_state"] is None:
+        return "not known"
+    counters = "" if status["tec"] is None else f", TEC {status['tec']}, REC {status['rec']}"
+    times = status["answer_time_ms"]
+    answers = f", answers in {times['median']:.1f} ms" if times else ""
+    return f"{status['bus_state']}{counters}{answers}"
+
+
+def _duration(seconds: float) -> str:
+    """Its two largest units: `3 d 4 h`."""
+    minutes, left = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    days, hours = divmod(hours, 24)
+    if days:
+        return f"{days} d {hours} h"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {left} s" if minutes else f"{left} s"

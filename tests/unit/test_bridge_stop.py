@@ -23,7 +23,8 @@ def test_what_it_has_taken_is_on_the_bus_before_it_is_closed(bench: Bench) -> No
     for n in range(TRANSMIT_FIFO):
         bench.bus.far.send(FRAME.pack(n, 8, bytes(8)))
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == TRANSMIT_FIFO)
-    stopped(bridge)
+    assert bridge.snapshot()["channel_open"]
+    assert not stopped(bridge)["channel_open"]
     assert [f.can_id for f in bench.frames] == list(range(TRANSMIT_FIFO))
 
 
@@ -32,5 +33,5 @@ def test_a_stop_does_not_need_an_answer(bench: Bench) -> None:
     bridge = started(bench.bridge())
     run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-active")
     bench.device.silent = True
-    stopped(bridge)
+    assert stopped(bridge)["channel_open"]  # for all that is known
     assert bridge.reason == ""

@@ -1,8 +1,10 @@
 """The process: signals, reload, what systemd is told. systemd itself is in tests/system/test_systemd.py."""
 
+import fcntl
 import json
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -16,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from bridged import journal, notify, service
+from bridged import VERSION, journal, notify, service
 from bridged.bridge import Bridge
 from bridged.config import load
 from bridged.errors import ConfigError
@@ -91,9 +93,13 @@ class TestProcess:
         (package / "daemon.py").write_text(DAEMON)
         started = []
 
-        def start(file: Path, **environment: str) -> subprocess.Popen[str]:
+        def start(file: Path, redirect: str = "", **environment: str) -> subprocess.Popen[str]:
             process = subprocess.Popen(
                 [
+                    "sh",
+                    "-c",
+                    f'exec "$@" {redirect}',
+                    "sh",
                     sys.executable,
                     "-m",
                     "bridged",
@@ -129,6 +135,30 @@ class TestProcess:
         assert "/nowhere/tty: does not exist" in waiting
         process.terminate()
         assert systemd.hear() == "STOPPING=1"
+        _, log = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0
+        lines = log.splitlines()
+        first = f"one: can-bridge {VERSION}: {tmp_path}/one.yaml: can232 on /nowhere/tty to virtual a"
+        assert lines[0].endswith(first)
+        last = r" one: stopped after \d s: 0 frames received, 0 sent; none dropped; the adapter's channel was"
+        assert re.search(last, lines[-1])
+
+    @pytest.mark.parametrize(
+        ("redirect", "closed"), [("2>&-", (2,)), ("2>/dev/full", ()), ("0<&- 1>&- 2>&-", (0, 1, 2))]
+    )
+    def test_it_runs_without_anybody_to_talk_to(
+        self,
+        tmp_path: Path,
+        systemd: Systemd,
+        start: Callable[..., subprocess.Popen[str]],
+        redirect: str,
+        closed: tuple[int, ...],
+    ) -> None:
+        process = start(write_config(tmp_path / "one.yaml"), redirect)
+        systemd.wait_for("STATUS=waiting: ")
+        for fd in closed:  # or a port might get the number, and what Python says last
+            assert str(Path(f"/proc/{process.pid}/fd/{fd}").readlink()) == os.devnull
+        process.terminate()
         assert process.wait(DEADLINE_S) == 0
 
     def test_reload(
@@ -181,6 +211,41 @@ class TestProcess:
         _, log = process.communicate(timeout=DEADLINE_S)
         assert process.returncode == 78
         assert "apt install python3-systemd" in log
+
+
+class TestSignals:
+    @pytest.fixture
+    def made(self) -> tuple[Service, list[str]]:
+        done: list[str] = []
+        bridge: Any = SimpleNamespace(
+            config=None, state=State.RUNNING, finished=False, stop=lambda: done.append("stop")
+        )
+
+        def successor(_present: Any) -> None:
+            done.append("reload")
+
+        return Service(bridge, None, successor), done
+
+    def test_many_are_one_reload(self, made: tuple[Service, list[str]]) -> None:
+        running, done = made
+        with service._signals() as (reader, came):
+            for _ in range(100):
+                os.kill(os.getpid(), signal.SIGHUP)
+            running._on_signals(reader, came)
+            assert (done, came) == (["reload"], set())
+            with pytest.raises(BlockingIOError):
+                os.read(reader, 1)
+
+    def test_a_stop_comes_first_also_if_its_number_finds_no_place(
+        self, made: tuple[Service, list[str]]
+    ) -> None:
+        running, done = made
+        with service._signals() as (reader, came):
+            for _ in range(fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096) + 1):
+                os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGTERM)
+            running._on_signals(reader, came)
+        assert done == ["stop"]
 
 
 class TestReload:
@@ -341,9 +406,9 @@ class TestNotifier:
     def test_a_status_is_one_line_and_told_once(self) -> None:
         heard: list[str] = []
         made = Notifier(heard.append)
-        for text in ("a\nb", "a\nb", "c"):
+        for text in ("a\nREADY=1", "a\nREADY=1", "c\udcff"):
             made.status(text)
-        assert heard == ["STATUS=a b", "STATUS=c"]
+        assert heard == ["STATUS=a\\nREADY=1", "STATUS=c\\xff"]
 
     def test_a_systemd_that_does_not_listen_is_no_reason_to_end(
         self, caplog: pytest.LogCaptureFixture
@@ -368,7 +433,8 @@ class TestNotifier:
         (State.WAITING, "it does not exist", True, "waiting: it does not exist"),
         (State.BACKOFF, "no answer", True, "waiting: no answer"),
         (State.FAULT, "the wrong one", True, "fault: the wrong one"),
-        (State.IDLE, "no such interface", False, "bus not open: no such interface"),
+        (State.IDLE, "bus not open: no such interface", False, "bus not open: no such interface"),
+        (State.RUNNING, "bus lost: vcan0; opening it again", False, "bus lost: vcan0; opening it again"),
         (State.OPENING, "", True, ""),
         (State.STOPPING, "", True, "stopping"),
     ],
@@ -396,10 +462,22 @@ class TestLog:
         assert fields.filter(record)
         assert json.dumps([record.__dict__["BRIDGE"], record.__dict__["STATE"]]) == '["can232", "running"]'
 
-    def test_each_line_has_its_priority(self) -> None:
+    def test_each_line_of_a_traceback_has_its_priority(self) -> None:
         made = journal.PrefixFormatter("can232: %(message)s")
-        assert made.format(self.record()) == "<4>can232: one\n<4>two"
+        record = self.record()
+        record.exc_text = "Traceback\nValueError"
+        assert made.format(record).splitlines() == ["<4>can232: one\\ntwo", "<4>Traceback", "<4>ValueError"]
         assert made.format(self.record(logging.INFO, "x")) == "<6>can232: x"
+
+    def test_a_device_writes_no_line_of_its_own(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr(logging, "root", logging.RootLogger(logging.WARNING))
+        monkeypatch.setattr(journal.StderrHandler, "emit", logging.StreamHandler.emit)
+        journal.start_logging("50%s\udcff", verbose=False)
+        logging.root.info("serial_number=%s", "A\x1b[2J\n12:00:00 INFO    all is well")
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.endswith(r"INFO    50%s\xff: serial_number=A\x1b[2J\n12:00:00 INFO    all is well")
 
     def test_stderr_is_the_journal_only_if_it_is_the_same_stream(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

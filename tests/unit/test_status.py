@@ -1,62 +1,20 @@
-"""The status socket: who may ask, what others can do to it, and what a false one can do to who asks."""
+"""The status: who may ask, what others can do to its socket and a false one to who asks, how it is shown."""
 
 from __future__ import annotations
 
-import contextlib
 import os
-import select
 import socket
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from status_socket import listening, serving, snapshot
 
 from bridged import status
-from bridged.status import NoAnswerError, StatusError, StatusServer, own_socket_path, query
+from bridged.status import NoAnswerError, StatusError, StatusServer, farewell, own_socket_path, query, render
 
 GROUP = 12345
-
-
-@contextlib.contextmanager
-def listening(path: Path, talk: Callable[[socket.socket], None]) -> Iterator[None]:
-    """Somebody who listens at `path` and talks to one who connects."""
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-
-        def serve() -> None:
-            with contextlib.suppress(OSError), listener.accept()[0] as connection:
-                talk(connection)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield
-        with contextlib.suppress(OSError):
-            listener.shutdown(socket.SHUT_RDWR)
-        thread.join()
-
-
-@contextlib.contextmanager
-def serving(path: Path, found: dict[str, Any]) -> Iterator[None]:
-    """A bridge with this status."""
-    server = StatusServer(path, lambda: found)
-    end, ended = socket.socketpair()
-
-    def serve() -> None:
-        while ended not in select.select([server, ended], [], [])[0]:
-            server.on_readable()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield
-    finally:
-        end.close()
-        thread.join()
-        ended.close()
-        server.close()
 
 
 def answer(text: bytes) -> Callable[[socket.socket], None]:
@@ -161,7 +119,7 @@ class TestDirectory:
         fallback.chmod(0o775)
         if os.getuid() == 0:
             os.chown(fallback, GROUP, GROUP)
-        with pytest.raises(StatusError, match=f"chmod go-w {fallback}"):
+        with pytest.raises(StatusError, match="other users may write in"):
             own_socket_path("a")
 
     def test_a_link_to_one_of_ours_is_refused(self, fallback: Path, tmp_path: Path) -> None:
@@ -243,3 +201,62 @@ class TestQuery:
         assert ("usermod" in str(caught.value)) == (group == status.GROUP)
         with pytest.raises(StatusError, match=r"no permission for .*ask as"):
             query(tmp_path / "none.sock")
+
+
+class TestText:
+    def test_the_state_comes_first_and_each_direction_has_its_drops(self) -> None:
+        counters = snapshot()["counters"] | {"tx_dropped": {"queue-full": 3, "stale": 0}}
+        assert render(snapshot(counters=counters, uptime_s=7500)).splitlines() == [
+            "can232: running, up 2 h 5 min",
+            "  adapter     can232 on /dev/ttyUSB0, version V1010, serial number A123",
+            "  CAN bus     error-active, TEC 0, REC 3, answers in 0.6 ms",
+            "  interface   socketcan vcan0",
+            "  received    20 frames from the adapter, 10/s, 0 line errors, 0 adapter overruns",
+            "  rx dropped  none",
+            "  sent        84 frames to the adapter, 42/s, 1 retries, 0 queued",
+            "  tx dropped  queue-full 3",
+            "  can-bridge  version 1.2.3",
+        ]
+
+    def test_what_is_not_known(self) -> None:
+        bus = snapshot()["bus"] | {"open": False}
+        lines = render(
+            snapshot(state="idle", reason="no vcan0", bus_state=None, tec=None, bus=bus)
+        ).splitlines()
+        assert lines[:2] == ["can232: idle, up 9 s", "  reason      no vcan0"]
+        assert lines[3:5] == ["  CAN bus     not known", "  interface   socketcan vcan0, NOT OPEN"]
+
+    def test_a_device_does_not_move_the_cursor(self) -> None:
+        adapter = snapshot()["adapter"] | {"serial_number": "A\x1b[2J\nroot: running"}
+        (line,) = [line for line in render(snapshot(adapter=adapter)).splitlines() if "serial" in line]
+        assert line.endswith(r"serial number A\x1b[2J\nroot: running")
+
+    @pytest.mark.parametrize("part", ["adapter", "rates", "uptime_s", "version"])
+    def test_one_of_another_version(self, part: str) -> None:
+        with pytest.raises(StatusError, match="another version"):
+            render(snapshot(**{part: None}) if part != "version" else {"counters": {}})
+
+    @pytest.mark.parametrize(
+        ("changes", "text"),
+        [
+            ({}, "none dropped; the adapter's channel may still be open"),
+            ({"channel_open": False}, "none dropped; the adapter's channel is closed"),
+            (
+                {"channel_open": None, "bus": {"open": False}},
+                "none dropped; the adapter's channel was never opened",
+            ),
+            (
+                {"counters": {"tx_dropped": {"stale": 2, "full": 3}, "rx_dropped": {"not-running": 1}}},
+                "rx dropped: not-running 1; tx dropped: stale 2, full 3; "
+                "the adapter's channel may still be open",
+            ),
+        ],
+    )
+    def test_farewell(self, changes: dict[str, Any], text: str) -> None:
+        counters = snapshot()["counters"] | changes.pop("counters", {})
+        told = farewell(snapshot(counters=counters, **changes))
+        assert told == f"stopped after 9 s: 20 frames received, 84 sent; {text}"
+
+    def test_durations(self) -> None:
+        times = {59.9: "59 s", 61: "1 min 1 s", 3600: "1 h 0 min", 8_640_000 + 7200: "100 d 2 h"}
+        assert {seconds: status._duration(seconds) for seconds in times} == times

@@ -1,0 +1,209 @@
+"""The commands as a user meets them: what they show, say and return, and what becomes of it in a pipe."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from status_socket import serving, snapshot
+
+from bridged import VERSION, cli, status
+
+CONFIG = """\
+adapter: {type: can232, port: /nowhere/tty, baudrate: 115200}
+channel: {bitrate: 125000}
+bus: {interface: virtual, channel: a}
+"""
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The directory of the status sockets, of root's bridges and ours."""
+    monkeypatch.setattr(status, "SYSTEM_DIRECTORY", tmp_path)
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    return tmp_path
+
+
+@pytest.fixture
+def configs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    directory = tmp_path / "etc"
+    directory.mkdir()
+    (directory / "can232.yaml").write_text(CONFIG)
+    monkeypatch.setattr(cli, "CONFIG_DIRECTORY", directory)
+    return directory
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["--version"])
+    assert capsys.readouterr().out == f"can-bridge {VERSION}\n"
+
+
+class TestStatus:
+    def test_the_only_one_is_shown_in_full(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        with serving(run / "can232.sock", snapshot()):
+            assert cli.main(["status"]) == 0
+            text = capsys.readouterr().out
+            assert text == f"{status.render(snapshot())}\n"
+            assert cli.main(["status", "can232"]) == 0
+            assert capsys.readouterr().out == text
+            assert cli.main(["status", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == snapshot()
+
+    def test_several_have_a_line_each(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        waiting = snapshot("b", state="waiting", reason="/dev/ttyUSB1: does not exist")
+        with serving(run / "a.sock", snapshot("a")), serving(run / "b.sock", waiting):
+            assert cli.main(["status"]) == 3
+            assert capsys.readouterr().out.splitlines() == [
+                "a: running, up 9 s, 20 frames received, 84 sent, 0 dropped",
+                "b: waiting, up 9 s, 20 frames received, 84 sent, 0 dropped (/dev/ttyUSB1: does not exist)",
+            ]
+            assert cli.main(["status", "--json"]) == 3
+            lines = capsys.readouterr().out.splitlines()
+            assert [json.loads(line)["name"] for line in lines] == ["a", "b"]
+            assert cli.main(["status", "a"]) == 0
+
+    def test_one_of_several_that_was_killed(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        with serving(run / "b.sock", snapshot("b")):
+            with serving(run / "a.sock", snapshot("a")):
+                (run / "a.sock").rename(run / "c.sock")
+            assert cli.main(["status"]) == 3
+            first, second = capsys.readouterr().out.splitlines()
+            assert first.startswith("b: running")
+            assert second == f"c: no bridge answers on {run}/c.sock: Connection refused"
+            assert cli.main(["status", "--json"]) == 3
+        out, err = capsys.readouterr()
+        assert json.loads(out)["name"] == "b"
+        assert err.startswith("can-bridge: c: no bridge answers")
+
+    def test_none_runs(
+        self, run: Path, configs: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def said(*arguments: str) -> str:
+            assert cli.main(["status", *arguments]) == 3
+            return capsys.readouterr().err
+
+        assert said() == "can-bridge: no bridge is running: start one with `can-bridge run NAME`\n"
+        hint = "start it with `can-bridge run can232` or `systemctl start can-bridge@can232`"
+        assert said("can232") == f"can-bridge: can232 is not running: {hint}\n"
+        assert said("other") == f"can-bridge: other is not running, and there is no {configs}/other.yaml\n"
+        file = configs / "can232.yaml"
+        assert (
+            said(str(file))
+            == f"can-bridge: can232 is not running: {hint.replace('run can232', f'run {file}')}\n"
+        )
+        with serving(run / "a.sock", snapshot()):
+            (run / "a.sock").rename(run / "can232.sock")  # and the one that ends does not find it
+        assert said("can232") == said() == f"can-bridge: can232 is not running: {hint}\n"
+        monkeypatch.setattr(os, "geteuid", lambda: 1000)
+        assert "is not running (but for other users' bridges, which only they can see): start" in said(
+            "can232"
+        )
+
+    @pytest.mark.usefixtures("configs")
+    def test_a_watch_outlives_the_bridge(
+        self, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """It is there, away, away, there again; then Ctrl-C."""
+        bridge = contextlib.ExitStack()
+        start: Callable[[], Any] = lambda: bridge.enter_context(serving(run / "can232.sock", snapshot()))  # noqa: E731
+        steps = iter([bridge.close, lambda: None, start, bridge.close])
+
+        def sleep(_seconds: float) -> None:
+            step = next(steps, None)
+            if step is None:
+                raise KeyboardInterrupt
+            step()
+
+        monkeypatch.setattr(cli.time, "sleep", sleep)
+        start()
+        assert cli.main(["status", "--watch", "can232"]) == 130
+        heads = [line for line in capsys.readouterr().out.splitlines() if line.startswith("can232")]
+        away = "can232 is not running: start it with `can-bridge run can232` or …"
+        assert [head[: len(away) - 1] for head in heads] == [
+            "can232: running, up 9 s",
+            away[:-1],
+            away[:-1],
+            "can232: running, up 9 s",
+            away[:-1],
+        ]
+        assert all(head.endswith("; waiting for it") for head in heads if "not running" in head)
+
+    @pytest.mark.usefixtures("configs")
+    def test_programs_that_watch_get_objects_only(
+        self, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        bridge = contextlib.ExitStack()
+        steps = iter([lambda: None, bridge.close, lambda: None])
+
+        def sleep(_seconds: float) -> None:
+            step = next(steps, None)
+            if step is None:
+                raise KeyboardInterrupt
+            step()
+
+        monkeypatch.setattr(cli.time, "sleep", sleep)
+        bridge.enter_context(serving(run / "can232.sock", snapshot()))
+        assert cli.main(["status", "--watch", "--json", "can232"]) == 130
+        out, err = capsys.readouterr()
+        assert [json.loads(line)["name"] for line in out.splitlines()] == ["can232", "can232"]
+        assert err.count("can232 is not running") == 1
+
+    def test_a_small_terminal_shows_the_head(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(os, "get_terminal_size", lambda _fd: os.terminal_size((12, 3)))
+        monkeypatch.setattr(sys.stdout, "fileno", lambda: 1, raising=False)
+        assert cli._fitted(status.render(snapshot())) == "can232: runn\n  adapter   "
+
+
+class TestPipes:
+    def can_bridge(
+        self, *arguments: str, redirect: str, **environment: str
+    ) -> subprocess.CompletedProcess[str]:
+        """Its exit status is that of can-bridge, not that of the pipe."""
+        python = [sys.executable, "-m", "bridged"]
+        return subprocess.run(
+            ["bash", "-o", "pipefail", "-c", f'"$@" {redirect}', "bash", *python, *arguments],
+            capture_output=True,
+            check=False,
+            env={name: text for name, text in os.environ.items() if name != "PYTHONUNBUFFERED"} | environment,
+            text=True,
+            timeout=60,
+        )
+
+    @pytest.mark.parametrize("environment", [{}, {"PYTHONUNBUFFERED": "1"}], ids=["buffered", "unbuffered"])
+    @pytest.mark.parametrize("command", [["--help"], ["check", "FILE"], ["status", "--socket", "SOCKET"]])
+    def test_a_full_disk_is_told_once(
+        self, tmp_path: Path, command: list[str], environment: dict[str, str]
+    ) -> None:
+        (tmp_path / "one.yaml").write_text(CONFIG)
+        paths = {"FILE": str(tmp_path / "one.yaml"), "SOCKET": str(tmp_path / "a.sock")}
+        with serving(tmp_path / "a.sock", snapshot()):
+            words = [paths.get(word, word) for word in command]
+            done = self.can_bridge(*words, redirect=">/dev/full", **environment)
+        assert done.stderr == "can-bridge: cannot write to the standard output: No space left on device\n"
+        assert done.returncode == 1
+
+    @pytest.mark.parametrize("options", [[], ["--json"]])
+    def test_a_reader_that_has_seen_enough_is_no_error(self, tmp_path: Path, options: list[str]) -> None:
+        with serving(tmp_path / "a.sock", snapshot()):
+            command = ["status", "--watch", "--socket", str(tmp_path / "a.sock"), *options]
+            done = self.can_bridge(*command, redirect="| head -n 1")
+        assert (done.stderr, done.returncode) == ("", 1)
+
+    def test_closed_streams(self, tmp_path: Path) -> None:
+        (tmp_path / "one.yaml").write_text(CONFIG)
+        done = self.can_bridge("check", str(tmp_path / "one.yaml"), redirect="0<&- >&-")
+        assert (done.stderr, done.returncode) == ("", 0)
+        done = self.can_bridge("check", str(tmp_path / "none.yaml"), redirect="2>&-")
+        assert (done.stdout, done.returncode) == ("", 78)
+
+    def test_a_name_in_no_encoding(self, tmp_path: Path) -> None:
+        done = self.can_bridge("check", f"{tmp_path}/br\udcfccke.yaml", redirect="")
+        assert r"br\xfccke.yaml" in done.stderr
