@@ -281,14 +281,16 @@ class Bridge:
             self._sharing.suspect(time.monotonic())
         if self._polling.heard_noise() and reason and self.state in FAILING:
             reason += f"; there is {NOISE} ({NOISE_CAUSES})"
+        if self.state is State.BUS_OFF:
+            reason = f"the bridge has taken the adapter off its CAN bus: {self.reason}"
         self.reason = reason or (self.reason if self.state in AFTERMATH else "")
         times = self._told.tell(reason, time.monotonic()) if reason else None
         if times is not None:
             log.warning("state=%s: %s%s", self.state.value, reason, repeated(times))
             return
         quiet = self._told.quiet if self.state is State.RUNNING else self._told.failing
-        ending = self.state in {State.STOPPING, State.STOPPED}
-        level = logging.DEBUG if quiet and not ending else logging.INFO
+        always = self.state in {State.STOPPING, State.STOPPED, State.BUS_OFF}
+        level = logging.DEBUG if quiet and not always else logging.INFO
         log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
         if self.state is State.RUNNING:
             self._told.well()
@@ -505,4 +507,4 @@ class Bridge:
 
     def _on_bus_off(self, cause: str) -> None:
         if self.state is State.RUNNING:
-            self._bus_off.off(cause)
+            self._bus_off.off(cause, self._polling)

@@ -61,11 +61,13 @@ class BusOff:
         restarting, self._restarting = self._restarting, False
         return restarting
 
-    def off(self, cause: str) -> None:
+    def off(self, cause: str, polling: HealthPolling) -> None:
         """It is bus-off, or cannot tell whether it is."""
         restart_s = self.config.channel.restart_s
         if restart_s == 0.0:  # it restarts itself
             return
+        polling.taken_off()
+        self._restarting = True
         if restart_s is None:
             bus = self.config.bus
             how = "a new start of the bridge"
@@ -75,7 +77,6 @@ class BusOff:
                 Event.BUS_OFF, f"{cause}; channel.restart is never: {how} puts it on the bus again"
             )
             return
-        self._restarting = True
         self._begin_anew(restart_s, f"{cause}{ANEW}")
 
     def stuck(self, frames: int, polling: HealthPolling) -> None:
@@ -88,7 +89,9 @@ class BusOff:
             why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
             self._begin_anew(pause_s, f"{cause}, {frames} are in its buffer ({why}){ANEW}")
         elif now - polling.full_at <= limit_s:  # it cannot tell bus-off
-            self.off(f"{cause} (does another node acknowledge them?), its status: {polling.description}")
+            self.off(
+                f"{cause} (does another node acknowledge them?), its status: {polling.description}", polling
+            )
         elif now >= self._refusing_until:
             self._refusing_until = now + self._refusing.next_s(now)
             reason = f"the adapter refuses every frame, its status: {polling.description}"

@@ -111,6 +111,13 @@ class Health:
             frames.append(self._state_frame())
         return frames
 
+    def taken_off(self) -> list[bytes]:
+        """The bridge takes the adapter off its CAN bus, whatever that says of itself; the error frames for it."""
+        if self._told is BusState.BUS_OFF:
+            return []
+        self._told = BusState.BUS_OFF
+        return [error_frame(CAN_ERR_BUSOFF)]
+
     def _happened(self, happened: Happened) -> Iterator[bytes]:
         for what in happened:
             name = str(what.name).lower()

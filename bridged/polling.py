@@ -86,6 +86,11 @@ class HealthPolling:
         self._unknown = 0
         self.next_at = now
 
+    def taken_off(self) -> None:
+        """The adapter is bus-off, or taken for it, and its channel is being closed."""
+        for frame in self.health.taken_off():
+            self._tell(frame)
+
     def stop(self) -> None:
         """The adapter is no more: whatever it still answers is of no interest."""
         self.next_at = None
@@ -228,12 +233,12 @@ class HealthPolling:
         """A bus that is never well for long is not told each time."""
         if state is BusState.ERROR_ACTIVE:
             level = logging.DEBUG if self._told.quiet else logging.INFO
-            log.log(level, "bus_state=%s: %s", state.text, description)
+            log.log(level, "CAN bus: %s again", state.text)
             self._told.well()
             return
         times = self._told.tell(state.text, time.monotonic())
         if times is not None:
-            log.warning("bus_state=%s: %s%s", state.text, description, repeated(times))
+            log.warning("CAN bus: %s: %s%s", state.text, description, repeated(times))
 
     def _warn(self, pattern: str, text: str) -> None:
         """Each text once in LOG_INTERVAL_S, and not too often in an hour."""

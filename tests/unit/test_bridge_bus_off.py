@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,14 @@ from bridged import bridge as bridge_module
 from bridged.adapters.base import Steps
 from bridged.bridge import Bridge
 from bridged.buses.python_can import PythonCanBus
-from bridged.health import CAN_ERR_RESTARTED, BusState, error_frame
+from bridged.health import (
+    CAN_ERR_BUSOFF,
+    CAN_ERR_CRTL,
+    CAN_ERR_RESTARTED,
+    CRTL_ACTIVE,
+    BusState,
+    error_frame,
+)
 from bridged.lifecycle import Event, State
 from bridged.simulators.can232 import Can232
 
@@ -64,7 +72,8 @@ def heals(bench: Bench, bridge: Bridge, device: Can232, born: list[float]) -> No
     *before, last = bench.frames
     assert last.can_id == NEW
     assert all(born[frame.can_id - OLD] > oldest for frame in before)
-    assert error_frame(CAN_ERR_RESTARTED) in frames_on_bus(bench)
+    told = frames_on_bus(bench)
+    assert told.index(error_frame(CAN_ERR_BUSOFF)) < told.index(error_frame(CAN_ERR_RESTARTED))
     assert status["counters"]["bus_off_restarts"] == status["counters"]["reconnects"] >= 1
 
 
@@ -116,7 +125,9 @@ def test_a_can232_with_a_few_frames_that_nobody_acknowledges_is_restarted(can232
 
 
 @pytest.mark.parametrize("event", [Event.RESTART, Event.STOP])
-def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(can232: Bench, event: Event) -> None:
+def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(
+    can232: Bench, event: Event, caplog: pytest.LogCaptureFixture
+) -> None:
     device = Can232(time.monotonic())
     can232.plug_in(device)
     bridge = started(can232.bridge("bitrate: 125000, restart: never", TRANSMIT))
@@ -124,15 +135,21 @@ def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(can232: Bench,
     send(can232, OLD, 3)
     run_until(bridge, lambda: bridge.state is State.BUS_OFF)
     assert "channel.restart is never: ip link set vcan0 down, then up" in bridge.reason
+    (line,) = [record for record in caplog.records if "state=bus-off" in record.getMessage()]
+    assert (line.levelno, "the adapter off its CAN bus: " in line.getMessage()) == (logging.WARNING, True)
+    told = frames_on_bus(can232)
+    assert told.count(error_frame(CAN_ERR_BUSOFF)) == 1
     device.set_bus_off(time.monotonic(), False)
     send(can232, OLD)
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["adapter-away"] == 1)
     assert (bridge.state, bridge.next_timer()) == (State.BUS_OFF, None)
     if event is Event.RESTART:
         bridge._dispatch(event)
-        run_until(bridge, lambda: bridge.state is State.RUNNING)
+        run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.ERROR_ACTIVE.text)
     stopped(bridge)
     assert can232.frames == []
+    back = [error_frame(CAN_ERR_RESTARTED), error_frame(CAN_ERR_CRTL, crtl=CRTL_ACTIVE)]
+    assert frames_on_bus(can232) == (back if event is Event.RESTART else [])
 
 
 def test_a_usb2can_restarts_itself(usb2can: Usb2canBench) -> None:
@@ -157,11 +174,12 @@ def test_a_usb2can_is_taken_off_the_bus_if_it_is_not_to_restart_itself(
     run_until(bridge, lambda: bridge.state in {State.BACKOFF, State.BUS_OFF})
     assert device.chip.in_reset
     assert bridge.state is (State.BUS_OFF if restart == "never" else State.BACKOFF)
+    assert frames_on_bus(usb2can).count(error_frame(CAN_ERR_BUSOFF)) == 1
     device.set_bus_off(time.monotonic(), False)
     if restart == "never":
         bridge._dispatch(Event.RESTART)
     run_until(bridge, lambda: bridge.state is State.RUNNING)
-    assert (error_frame(CAN_ERR_RESTARTED) in frames_on_bus(usb2can)) == (restart != "never")
+    assert error_frame(CAN_ERR_RESTARTED) in frames_on_bus(usb2can)
     stopped(bridge)
 
 
