@@ -112,7 +112,7 @@ class Health:
         return frames
 
     def taken_off(self) -> list[bytes]:
-        """The bridge takes the adapter off its CAN bus, whatever that says of itself; the error frames for it."""
+        """The bridge takes the adapter off its CAN bus, whatever that says; the error frames for it."""
         if self._told is BusState.BUS_OFF:
             return []
         self._told = BusState.BUS_OFF

@@ -28,6 +28,7 @@ Handler = Callable[[], None]
 # The bridge that is to take the place of one with this configuration; None: nothing has changed. ConfigError.
 Successor = Callable[["Config"], "Bridge | None"]
 
+READY_LIMIT_S = 5.0  # a boot does not wait longer for the CAN interface
 PIPE_SIZE = 1 << 16  # all that fits into the pipe of the signals
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
@@ -88,7 +89,7 @@ class Service:
         self._notifier = notifier or Notifier()
         self._make_successor = successor
         self._successor: Bridge | None = None  # waits for the end of `bridge`
-        self._ready = False
+        self._ready_at: float | None = None  # what the service waits for is told by then; None: it was
         self._status = ""
         self._told: tuple[object, ...] = ()
         self._refusal = ""  # why the last reload was refused
@@ -101,6 +102,7 @@ class Service:
             if status is not None:
                 selector.register(status, selectors.EVENT_READ, status.on_readable)
             self._watch(selector)
+            self._ready_at = time.monotonic() + READY_LIMIT_S
             try:
                 self.bridge.start()
                 self._tell()
@@ -121,7 +123,7 @@ class Service:
 
     def _turn(self, selector: selectors.BaseSelector) -> None:
         timers = [] if self.bridge.finished else [self.bridge.next_timer()]
-        timer = min((at for at in (*timers, self._feed_at) if at is not None), default=None)
+        timer = min((at for at in (*timers, self._feed_at, self._ready_at) if at is not None), default=None)
         timeout = None if timer is None else max(0.0, timer - time.monotonic())
         # One handler may serve several descriptors; it runs once.
         handlers: dict[Handler, None] = {key.data: None for key, _ in selector.select(timeout)}
@@ -172,7 +174,7 @@ class Service:
             log.info("reload: the configuration has changed, the adapter stays open")
             self._notifier.ready()
             return
-        log.info("reload: the configuration has changed, the adapter is opened anew")
+        log.info("reload: the configuration has changed, reopening the adapter")
         self._discard_successor()
         self._successor = successor
         self.bridge.stop()
@@ -197,6 +199,10 @@ class Service:
 
     def _tell(self) -> None:
         state, reason, bus_open = self.bridge.condition()
+        self._tell_status(state, reason, bus_open=bus_open)
+        self._tell_ready(time.monotonic(), reason, bus_open=bus_open)
+
+    def _tell_status(self, state: State, reason: str, *, bus_open: bool) -> None:
         told = (self.bridge, state, reason, bus_open, self._refusal)
         if told == self._told:
             return
@@ -204,11 +210,17 @@ class Service:
         self._status = _describe(self.bridge, state, reason, bus_open=bus_open) or self._status
         refusal = f" (reload refused: {self._refusal})" if self._refusal else ""
         self._notifier.status(self._status + refusal)
-        if bus_open and not self._ready:
-            self._ready = True
-            self._notifier.ready()
-            if self._notifier.feed_interval_s is not None:
-                self._feed_at = time.monotonic()
+
+    def _tell_ready(self, now: float, reason: str, *, bus_open: bool) -> None:
+        """Once: the interface is open, or it is not to be had and a boot must not hang for it."""
+        if self._ready_at is None or not (bus_open or now >= self._ready_at):
+            return
+        self._ready_at = None
+        if not bus_open:
+            log.error("ready without the CAN interface, which is tried again each second: %s", reason)
+        self._notifier.ready()
+        if self._notifier.feed_interval_s is not None:
+            self._feed_at = now
 
     def _feed(self, now: float) -> None:
         """Feeds the watchdog if the relay has turned since the last time: each feeding gives it cause to."""

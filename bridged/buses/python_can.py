@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import socket
 import struct
+import traceback
 import uuid
 from typing import TYPE_CHECKING, Any, Final
 
@@ -63,8 +65,20 @@ def open_python_can(interface: str, channel: str, options: Mapping[str, object])
     try:
         bus = can.Bus(interface=interface, channel=channel or None, **arguments)
     except Exception as error:  # drivers raise far more than CanError
+        _release_half_made(error)
         raise BusError(f"{interface} {channel}: {error or type(error).__name__}") from error
     return PythonCanBus(interface, channel, bus)
+
+
+def _release_half_made(error: Exception) -> None:
+    """A bus whose constructor failed is let go, or it keeps what it opened and complains at its end."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        bus = frame.f_locals.get("self")
+        if isinstance(bus, can.BusABC):
+            for shutdown in (bus.shutdown, lambda bus=bus: can.BusABC.shutdown(bus)):
+                with contextlib.suppress(Exception):  # it lacks what its constructor did not come to
+                    shutdown()
+            return
 
 
 class PythonCanBus(Pump):

@@ -68,7 +68,9 @@ class Instance:
         self.socket = Path("/run/can-bridge", f"{name}.sock")
         self._since = f"@{time.time():.3f}"  # a cursor and matches together lose the first entry
 
-    def configure(self, port: str | Path, *, adapter: str = "can232", **transmit: Any) -> None:
+    def configure(
+        self, port: str | Path, *, adapter: str = "can232", create: bool = True, **transmit: Any
+    ) -> None:
         settings: dict[str, Any] = {"type": adapter, "port": str(port)}
         if adapter == "can232":
             settings["baudrate"] = 115200
@@ -78,7 +80,7 @@ class Instance:
                 {
                     "adapter": settings,
                     "channel": {"bitrate": 125000},
-                    "bus": {"channel": self.interface, "create": True},
+                    "bus": {"channel": self.interface, "create": create},
                     "transmit": {"deadline": 30.0} | transmit,
                 }
             )
@@ -192,6 +194,18 @@ class TestUnit:
         assert can232.systemctl("stop") < STOP_LIMIT_S
         assert can232.show("Result") == "success"
         assert not can232.socket.exists()
+
+    def test_a_boot_does_not_hang_without_the_interface(self, instance: Callable[[str], Instance]) -> None:
+        """It is ready without one, says so, and takes it when it comes."""
+        made = instance("early")
+        made.configure("/dev/ttyUSB99", create=False)
+        assert made.systemctl("start") < 10.0  # 5 s, and a slow Python's start
+        assert made.show("ActiveState") == "active"
+        made.wait_status(f"bus not open: {made.interface}: there is no such interface")
+        assert "ready without the CAN interface" in made.log("BRIDGE=early", "PRIORITY=3")
+        execute("ip", "link", "add", "dev", made.interface, "type", "vcan")
+        execute("ip", "link", "set", made.interface, "up")
+        made.wait_status("waiting: ")
 
     def test_restart(self, can232: Instance) -> None:
         pid = can232.pid

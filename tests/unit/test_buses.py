@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import os
 import select
 import socket
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import can
 import pytest
-from can.interfaces import virtual
+from can.interfaces import udp_multicast, virtual
 
 from bridged.buses import LOST_ERROR_FRAMES, open_bus, python_can, socketcan
 from bridged.buses.python_can import PythonCanBus, pack_message, unpack_frame
@@ -333,6 +334,21 @@ class TestOpenErrors:
     def test_own_messages(self) -> None:
         with pytest.raises(BusError, match="receive_own_messages would send every frame back"):
             open_bus("virtual", "x", create=False, options={"receive_own_messages": True})
+
+    def test_a_driver_that_fails_half_way_leaves_nothing_behind(
+        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """Tried each second, it would complain each second, and keep what it had opened."""
+
+        def refuse(*_arguments: object) -> None:
+            raise OSError(errno.EADDRINUSE, "Address already in use")
+
+        monkeypatch.setattr(udp_multicast.bus, "GeneralPurposeUdpMulticastBus", refuse)
+        for _ in range(3):
+            with pytest.raises(BusError, match="already in use"):
+                open_bus("udp_multicast", "239.74.163.2", create=False, options={})
+        gc.collect()
+        assert caplog.messages == []
 
     def test_driver_that_does_not_open(self) -> None:
         with pytest.raises(BusError, match=r"^serial /dev/nothing: ") as caught:

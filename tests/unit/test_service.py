@@ -18,10 +18,12 @@ from typing import Any
 
 import pytest
 
-from bridged import VERSION, journal, notify, service
+from bridged import VERSION, bus_end, journal, notify, service
+from bridged import bridge as bridge_module
 from bridged.bridge import Bridge
+from bridged.buses.python_can import open_python_can
 from bridged.config import load
-from bridged.errors import ConfigError
+from bridged.errors import BusError, ConfigError
 from bridged.lifecycle import State
 from bridged.memory import FileMemory
 from bridged.notify import Notifier
@@ -352,6 +354,64 @@ class TestReload:
         made = Service(Bridge(load(file), FileMemory(tmp_path)), Notifier(heard.append))
         self.run(made, [lambda: os.kill(os.getpid(), signal.SIGHUP)], heard)
         assert made.bridge.state is State.STOPPED
+
+
+class TestReady:
+    @pytest.fixture
+    def heard(self) -> list[str]:
+        return []
+
+    @pytest.fixture
+    def waiting(self, heard: list[str]) -> Service:
+        """A service in its first five seconds."""
+        bridge: Any = SimpleNamespace()
+        made = Service(bridge, Notifier(heard.append))
+        made._ready_at = 100.0 + service.READY_LIMIT_S
+        return made
+
+    def test_when_the_interface_is_open(self, waiting: Service, heard: list[str]) -> None:
+        waiting._tell_ready(100.1, "", bus_open=False)
+        assert heard == []
+        waiting._tell_ready(100.2, "", bus_open=True)
+        waiting._tell_ready(200.0, "vcan0 was deleted", bus_open=False)
+        assert heard == ["READY=1"]
+
+    def test_after_five_seconds_without_it(
+        self, waiting: Service, heard: list[str], caplog: pytest.LogCaptureFixture
+    ) -> None:
+        for now in (104.9, 105.0, 106.0):
+            waiting._tell_ready(now, "bus not open: vcan0: there is no such interface", bus_open=False)
+            assert heard == ["READY=1"] * (now >= 105.0)
+        (record,) = caplog.records
+        assert record.levelno == logging.ERROR
+        assert "there is no such interface" in record.getMessage()
+
+    def test_the_loop_wakes_for_it_and_goes_on_trying(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(service, "READY_LIMIT_S", 0.01)
+        monkeypatch.setattr(bus_end, "RETRY_S", 0.05)
+        opened: list[object] = []
+
+        def open_bus(*arguments: Any, **_options: Any) -> object:
+            opened.append(arguments)
+            if len(opened) < 3:
+                raise BusError("vcan0: there is no such interface")
+            return open_python_can("virtual", tmp_path.name, {})
+
+        monkeypatch.setattr(bridge_module, "open_bus", open_bus)
+        heard: list[str] = []
+
+        def notified(text: str) -> None:
+            heard.append(text)
+            if text.startswith("STATUS=waiting: /nowhere"):
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        config = load(write_config(tmp_path / "one.yaml"))
+        Service(Bridge(config, FileMemory(tmp_path)), Notifier(notified)).run()
+        assert heard[:2] == ["STATUS=bus not open: vcan0: there is no such interface", "READY=1"]
+        assert heard.count("READY=1") == 1
+        assert len(opened) == 3
 
 
 class TestWatchdog:
