@@ -1,4 +1,4 @@
-"""python -m bridged is can-bridge."""
+"""`python -P -m bridged` is can-bridge. Without -P, modules in the current directory come before ours."""
 
 import sys
 

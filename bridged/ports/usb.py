@@ -23,6 +23,7 @@ from usb.core import USBError, USBTimeoutError
 from bridged.errors import PortError
 from bridged.ports import sysfs
 from bridged.pump import POLL_INTERVAL_S, Pump
+from bridged.text import printable
 
 if TYPE_CHECKING:
     from array import array
@@ -250,7 +251,7 @@ def _serial_number(device: Any) -> str | None:
         return None
     finally:
         usb.util.dispose_resources(device)
-    return str(number) if number else None
+    return printable(str(number)) if number else None
 
 
 def _node(device: Any) -> Path:

@@ -248,6 +248,12 @@ class TestChoice:
         port.close()
         assert [chip.opened for chip in chips] == [0, 0, 0]
 
+    def test_a_serial_number_has_no_control_characters(self, plug: Callable[..., None]) -> None:
+        plug(Chip("A\x1b[2J\n"))
+        port = open_port(URL, 57600)
+        assert port.serial_number == r"A\x1b[2J\n"
+        port.close()
+
     def test_several_and_none_is_named(self, plug: Callable[..., None]) -> None:
         plug(Chip("B2", 4), Chip("A1", 5))
         text = rf"^{URL}: 2 of them: add a serial number \(A1, B2\), as {URL}/B2$"
