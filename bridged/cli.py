@@ -105,7 +105,7 @@ def _check(args: argparse.Namespace) -> int:
     adapter, channel, bus = config.adapter, config.channel, config.bus
     rate = f" at {adapter.baudrate} Bd" if adapter.type == "can232" else ""
     print(
-        f"{config.path}: good: {adapter.type} on {adapter.port}{rate}, "
+        f"{printable(str(config.path))}: good: {adapter.type} on {adapter.port}{rate}, "
         f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
         f"to {bus.interface} {bus.channel}"
     )
@@ -207,14 +207,15 @@ def _watch(args: argparse.Namespace) -> int:
 
 
 def _fitted(text: str) -> str:
-    """Cut to the terminal's size: a line that wraps, or one too many, would push the state out of it."""
+    """Its first lines that fit into the terminal: one more would push the first, with the state, out of it."""
     try:
         columns, rows = os.get_terminal_size(sys.stdout.fileno())
     except OSError:
         return text
     if not columns or not rows:  # a serial console
         return text
-    return "\n".join(line[:columns] for line in text.splitlines()[: max(1, rows - 1)])
+    folded = [line[at : at + columns] for line in text.splitlines() for at in range(0, len(line), columns)]
+    return "\n".join(folded[: max(1, rows - 1)])
 
 
 def _complain(text: str) -> None:

@@ -350,11 +350,14 @@ def _farewell(status: dict[str, Any]) -> list[str]:
     counters = status["counters"]
     rx, tx = _reasons(counters["rx_dropped"]), _reasons(counters["tx_dropped"])
     dropped = "; ".join([f"rx dropped: {rx}"] * bool(rx) + [f"tx dropped: {tx}"] * bool(tx))
-    channel = {None: "was never opened", False: "is closed", True: "may still be open"}
+    channel = {
+        None: "no adapter was reached",
+        False: "the adapter's channel is closed",
+        True: "the adapter's channel may still be open",
+    }
     return [
         f"stopped after {_duration(status['uptime_s'])}: {counters['rx_frames']} frames received, "
-        f"{counters['tx_frames']} sent; {dropped or 'none dropped'}; "
-        f"the adapter's channel {channel[status['channel_open']]}"
+        f"{counters['tx_frames']} sent; {dropped or 'none dropped'}; {channel[status['channel_open']]}"
     ]
 
 

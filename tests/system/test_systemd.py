@@ -267,9 +267,32 @@ class TestUnit:
         user = ("setpriv", "--reuid=nobody", "--regid=nogroup")
         asked = execute(*user, "--clear-groups", "can-bridge", "status", "two", status=3)
         assert asked == f"can-bridge: no permission for {two.socket}: " + (
-            "usermod -aG can-bridge USER, then log in again; or be root"
+            "usermod -aG can-bridge USER, then log in again; or ask as root (sudo)"
         )
         assert "two: " in execute(*user, "--groups=can-bridge", "can-bridge", "status", "two", status=3)
+
+    def test_root_runs_another_by_hand(self, instance: Callable[[str], Instance]) -> None:
+        """In the directory of the service's user."""
+        one, two = instance("one"), instance("two")
+        for made in (one, two):
+            made.configure("/dev/can-bridge/none")
+        two.systemctl("start")
+        process = subprocess.Popen(["can-bridge", "run", "one"])
+        try:
+            wait_until(one.socket.is_socket, "the status socket")
+            found = one.socket.stat()
+            assert (one.socket.owner(), one.socket.group(), found.st_mode & 0o777) == (
+                "root",
+                "can-bridge",
+                0o660,
+            )
+            member = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--groups=can-bridge")
+            lines = execute(*member, "can-bridge", "status", status=3).splitlines()
+            assert [line.partition(":")[0] for line in lines] == ["one", "two"]
+        finally:
+            process.terminate()
+            assert process.wait(DEADLINE_S) == 0
+        assert not one.socket.exists()
 
     def test_raw_usb(self, rig: Rig, instance: Callable[[str], Instance]) -> None:
         chip = rig.chip("ftdi0")

@@ -157,9 +157,10 @@ class TestStatus:
         assert err.count("can232 is not running") == 1
 
     def test_a_small_terminal_shows_the_head(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(os, "get_terminal_size", lambda _fd: os.terminal_size((12, 3)))
+        monkeypatch.setattr(os, "get_terminal_size", lambda _fd: os.terminal_size((20, 4)))
         monkeypatch.setattr(sys.stdout, "fileno", lambda: 1, raising=False)
-        assert cli._fitted(status.render(snapshot())) == "can232: runn\n  adapter   "
+        text = cli._fitted(status.render(snapshot(state="waiting", reason="there is no tty")))
+        assert text.splitlines() == ["can232: waiting, up ", "9 s", "  reason      there "]
 
 
 class TestPipes:
@@ -205,5 +206,10 @@ class TestPipes:
         assert (done.stdout, done.returncode) == ("", 78)
 
     def test_a_name_in_no_encoding(self, tmp_path: Path) -> None:
-        done = self.can_bridge("check", f"{tmp_path}/br\udcfccke.yaml", redirect="")
-        assert r"br\xfccke.yaml" in done.stderr
+        path = tmp_path / "br\udcfccke.yaml"
+        done = self.can_bridge("check", str(path), redirect="")
+        assert done.stderr.startswith(rf"{tmp_path}/br\xfccke.yaml: ")
+        path.write_text(CONFIG)
+        done = self.can_bridge("check", str(path), redirect="")
+        assert done.stdout.startswith(rf"{tmp_path}/br\xfccke.yaml: ")
+        assert (done.stderr, done.returncode) == ("", 0)

@@ -243,7 +243,7 @@ class TestText:
             ({"channel_open": False}, "none dropped; the adapter's channel is closed"),
             (
                 {"channel_open": None, "bus": {"open": False}},
-                "none dropped; the adapter's channel was never opened",
+                "none dropped; no adapter was reached",
             ),
             (
                 {"counters": {"tx_dropped": {"stale": 2, "full": 3}, "rx_dropped": {"not-running": 1}}},
