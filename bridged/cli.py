@@ -207,7 +207,7 @@ def _watch(args: argparse.Namespace) -> int:
 
 
 def _fitted(text: str) -> str:
-    """Its first lines that fit into the terminal: one more would push the first, with the state, out of it."""
+    """Its first lines that fit into the terminal: one more would push out the first, with the state."""
     try:
         columns, rows = os.get_terminal_size(sys.stdout.fileno())
     except OSError:
