@@ -43,7 +43,25 @@ def config_path(name: str) -> Path:
 def _load(name: str) -> Config:
     from bridged.config import load  # noqa: PLC0415 - 20 ms that `status` need not pay
 
-    return load(config_path(name))
+    return load(_existing(name))
+
+
+def _existing(name: str) -> Path:
+    """The path of a configuration; if there is none, ConfigError with the one that is probably meant."""
+    path = config_path(name)
+    try:
+        path.stat()
+    except FileNotFoundError:
+        near = [path.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+        near += [path.with_name(f"{path.name}.yaml"), CONFIG_DIRECTORY / f"{path.stem}.yaml"]
+        found = next((str(file) for file in near if file.is_file()), None)
+        if found is None and path.parent == CONFIG_DIRECTORY:
+            found = ", ".join(sorted(file.stem for file in CONFIG_DIRECTORY.glob("*.yaml")))
+        there = f"; there is {found}" if found else ""
+        raise ConfigError([f"{path}: there is no such file{there}"]) from None
+    except OSError:  # reading says why
+        pass
+    return path
 
 
 def _import_msgspec() -> None:
@@ -101,15 +119,33 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    config = _load(args.config)
+    names = args.config or sorted(map(str, CONFIG_DIRECTORY.glob("*.yaml")))
+    if not names:
+        raise ConfigError([f"{CONFIG_DIRECTORY}: there is no configuration, NAME.yaml: name a file"])
+    problems: list[str] = []
+    for name in names:
+        try:
+            _check_one(Path("/dev/stdin") if name == "-" else _existing(name))
+        except ConfigError as error:
+            problems += error.problems
+    if problems:
+        raise ConfigError(problems)
+    return 0
+
+
+def _check_one(path: Path) -> None:
+    from bridged.config import check  # noqa: PLC0415 - as above
+
+    config, warnings = check(path)
+    for warning in warnings:
+        print(warning, file=sys.stderr)
     adapter, channel, bus = config.adapter, config.channel, config.bus
     rate = f" at {adapter.baudrate} Bd" if adapter.type == "can232" else ""
     print(
-        f"{printable(str(config.path))}: good: {adapter.type} on {adapter.port}{rate}, "
+        f"{printable(str(config.path))}: OK: {adapter.type} on {adapter.port}{rate}, "
         f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
         f"to {bus.interface} {bus.channel}"
     )
-    return 0
 
 
 def _status_paths(args: argparse.Namespace) -> list[Path]:
@@ -253,8 +289,15 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
     )
     run.add_argument("--verbose", action="store_true", help="log details (debugging)")
 
-    check = add("check", "Check a configuration; exit status 78 if it is not good.", _check)
-    check.add_argument("config", metavar="FILE|NAME")
+    check = add(
+        "check", "Check configurations; exit status 78 if one cannot be used, 0 also with warnings.", _check
+    )
+    check.add_argument(
+        "config",
+        nargs="*",
+        metavar="FILE|NAME",
+        help=f"- is the standard input; default: all of {CONFIG_DIRECTORY}",
+    )
 
     status = add(
         "status",

@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bridged import can
-from bridged.port_names import USB_DEVICE, port_problem
+from bridged.port_names import USB_DEVICE, is_numbered_terminal, port_problem
 from bridged.yaml_source import (
     Problems,
     Section,
@@ -26,7 +26,11 @@ from bridged.yaml_source import (
 CRITICAL_LIMIT, READY_LIMIT = 15, 7
 """Frames. Known to work, and with the fewest ERROR messages of the pairs that were tried on a real one."""
 
-# --- The schema. A description completes "… is wanted, not the text 'fast'". ----------------------
+LONG_DEADLINE_S = 10.0
+CAN232_COMMANDS = 2
+"""What its serial buffer holds: CAN232 manual."""
+
+# --- The schema. A description completes "expected …, got the text 'fast'". ----------------------
 
 ADAPTER_TYPES = Meta(description="can232 or usb2can")
 Flag = Annotated[bool, Meta(description="true or false")]
@@ -213,13 +217,15 @@ _SECTIONS: dict[str, type[Struct]] = {
 
 _ADAPTERS: dict[str, type[AdapterConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
 
+_SPOKEN_BY_CAN232 = ("slcan", "slcand", "lawicel")
+
 _KEYS_OF_OTHERS = {
     "can232": {
         "critical_limit": "goes with type: usb2can; remove it",
         "ready_limit": "goes with type: usb2can; remove it",
     },
     "usb2can": {
-        "baudrate": "a FT245 has no baud rate: remove it",
+        "baudrate": "a USB2CAN has no baud rate, there is no serial line in it: remove it",
         "firmware": "goes with type: can232; remove it",
     },
 }
@@ -233,19 +239,66 @@ _RESERVED_OPTIONS = {
 
 def load(path: str | os.PathLike[str]) -> Config:
     """Return the configuration in a file; ConfigError with all problems, each with line and column."""
-    file = Path(path)
-    problems = Problems(str(path))
+    return _load(Path(path))[0]
+
+
+def check(path: str | os.PathLike[str]) -> tuple[Config, list[str]]:
+    """Return what load() does, and a line for each thing that is allowed but probably not meant.
+
+    ConfigError also where python-can lacks what the interface needs, which takes importing it.
+    """
+    config, top = _load(Path(path))
+    adapter, transmit = config.adapter, config.transmit
+    section = top.section("adapter")
+    if section and is_numbered_terminal(adapter.port):
+        text = (
+            "the next terminal gets this name when this one ends: use one that stays, as of simulate --link"
+        )
+        section.warn_key("port", text)
+    section = top.section("transmit") if "transmit" in top.nodes else None
+    if section and transmit.deadline_s > LONG_DEADLINE_S:
+        section.warn_key("deadline", f"a frame may reach the bus {transmit.deadline_s:g} s after it was sent")
+    if section and adapter.type == "can232" and transmit.window > CAN232_COMMANDS:
+        text = f"a CAN232 can hold {CAN232_COMMANDS} commands, more of them may be lost"
+        section.warn_key("window", text)
+    section = top.section("bus")
+    if section and config.bus.create and re.fullmatch(r"can\d+", config.bus.channel):
+        text = "a virtual interface of this name is made if there is none, so a real one cannot have it"
+        section.warn_key("channel", text)
+    if section and config.bus.interface != "socketcan":
+        _check_python_can(section, config.bus)
+    if top.problems:
+        raise top.problems.error()
+    return config, top.problems.warnings()
+
+
+def _check_python_can(section: Section, bus: BusConfig) -> None:
+    from bridged.buses import backends  # noqa: PLC0415 - python-can costs 85 ms and 19 MB
+
+    if text := backends.interface_problem(bus.interface):
+        section.refuse_value("interface", text)
+        return
+    for key in bus.options:
+        if problem := backends.option_problem(bus.interface, key):
+            text, refused = problem
+            (section.refuse_key if refused else section.warn_key)(key, text)
+
+
+def _load(file: Path) -> tuple[Config, Section]:
+    path = str(file)
+    problems = Problems(path)
     root = parse(read_text(file, problems), problems)
     if not isinstance(root, MappingNode) or foreign_tag(root):
         empty = root is None or is_empty(root)
         what = "the file is empty" if empty else "the file is no mapping (a 'key: value' in each line)"
         line, column = (0, 0) if root is None else (root.start_mark.line, root.start_mark.column)
-        problems.add(line, column, f"{what}; sections adapter, channel and bus are wanted")
+        problems.add(line, column, f"{what}; expected sections adapter, channel and bus")
         raise problems.error()
-    config = _read_file(file, Section(root, _SECTIONS, problems))
+    top = Section(root, _SECTIONS, problems)
+    config = _read_file(file, top)
     if config is None:
         raise problems.error()
-    return config
+    return config, top
 
 
 def _read_file(path: Path, top: Section) -> Config | None:
@@ -294,6 +347,10 @@ def _read_adapter(section: Section | None) -> AdapterConfig | None:
     if section is None:
         return None
     node = section.nodes.get("type")
+    if isinstance(node, ScalarNode) and node.value.lower() in _SPOKEN_BY_CAN232:
+        meant = f"a CAN232 speaks what {quoted(node.value)} names, LAWICEL's protocol: write type: can232"
+        section.refuse_value("type", meant)
+        node.value = "can232"  # for the other keys
     type_: str | None = node.value if isinstance(node, ScalarNode) and node.value in _ADAPTERS else None
     adapter: AdapterConfig | None = None
     if type_ is None:
@@ -337,9 +394,9 @@ def _check_limits(section: Section) -> None:
         return
     default = ", its default" if len(given) == 1 else ""
     if "ready_limit" in given:
-        text = f"a limit below critical_limit ({critical}{default}) is wanted, not {ready}"
+        text = f"expected a limit below critical_limit ({critical}{default}), got {ready}"
     else:
-        text = f"a limit above ready_limit ({ready}{default}) is wanted, not {critical}"
+        text = f"expected a limit above ready_limit ({ready}{default}), got {critical}"
     section.refuse_value(given[-1], text)
 
 
@@ -484,7 +541,7 @@ def _read_option(section: Section, key: str) -> Any:
         section.refuse_key(key, f"cannot be given; {_RESERVED_OPTIONS[key]}")
         return None
     if not key.isidentifier():
-        section.refuse_key(key, "unknown key; the name of an option is wanted, such as hop_limit")
+        section.refuse_key(key, "unknown key; expected the name of an option, such as hop_limit")
         return None
     node = section.nodes[key]
     items: list[Node] = node.value if isinstance(node, SequenceNode) else [node]
@@ -493,6 +550,6 @@ def _read_option(section: Section, key: str) -> Any:
         return None
     values = [scalar_value(item) for item in items if isinstance(item, ScalarNode)]
     if len(values) < len(items):
-        section.refuse_value(key, "a single value, or a list of single values, is wanted")
+        section.refuse_value(key, "expected a single value, or a list of single values")
         return None
     return values if isinstance(node, SequenceNode) else values[0]

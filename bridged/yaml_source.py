@@ -6,6 +6,7 @@ The surprises of YAML 1.1 (octal numbers, base 60, `1e6` as a text) end here.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping
 from types import UnionType
@@ -55,6 +56,11 @@ class Problems:
     def __init__(self, file: str) -> None:
         self._file = file
         self._found: list[tuple[int, int, str]] = []
+        self._doubts: list[tuple[int, int, str]] = []
+
+    def warn_at(self, node: Node, text: str) -> None:
+        """Add what is allowed, but probably not meant."""
+        self._doubts.append((node.start_mark.line + 1, node.start_mark.column + 1, text))
 
     def add(self, line: int, column: int, text: str) -> None:
         """Add a problem; line and column from 0, as YAML marks count them."""
@@ -66,8 +72,15 @@ class Problems:
 
     def error(self) -> ConfigError:
         """All of them in the order of the file, `FILE:LINE:COLUMN: text` each."""
-        ordered = sorted(self._found, key=lambda problem: problem[:2])
-        return ConfigError([f"{self._file}:{line}:{column}: {text}" for line, column, text in ordered])
+        return ConfigError(self._lines(self._found))
+
+    def warnings(self) -> list[str]:
+        """What was added by warn_at(), in the same form."""
+        return self._lines(self._doubts)
+
+    def _lines(self, found: list[tuple[int, int, str]]) -> list[str]:
+        ordered = sorted(found, key=lambda problem: problem[:2])
+        return [f"{self._file}:{line}:{column}: {text}" for line, column, text in ordered]
 
     def __bool__(self) -> bool:
         return bool(self._found)
@@ -79,7 +92,10 @@ def read_text(path: Path, problems: Problems) -> str:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise ConfigError([f"{path}: cannot be read: {error.strerror or error}"]) from error
+        from bridged.status import user_name  # noqa: PLC0415 - only for a file that cannot be read
+
+        by = f" (by user {user_name(os.geteuid())})" if isinstance(error, PermissionError) else ""
+        raise ConfigError([f"{path}: cannot be read: {error.strerror or error}{by}"]) from error
     if len(data) > MAX_BYTES:
         raise ConfigError([f"{path}: is larger than {MAX_BYTES} bytes: not a configuration"])
     try:
@@ -157,7 +173,7 @@ def scalar_value(node: ScalarNode) -> object:
 
 
 def describe(node: Node, *, number_wanted: bool = False) -> str:
-    """Say what a node is, after "… is wanted, not"; and how the number, which it may be, is written."""
+    """Say what a node is, after "expected …, got"; and how the number, which it may be, is written."""
     if isinstance(node, SequenceNode):
         return "a list"
     if not isinstance(node, ScalarNode):
@@ -249,9 +265,14 @@ class Section:
         """Report a value."""
         self.problems.add_at(self.nodes[key], f"{self._where(key)}: {text}")
 
+    def warn_key(self, key: str, text: str) -> None:
+        """Add a doubt about a key; nothing if it is not given."""
+        if key in self.keys:
+            self.problems.warn_at(self.keys[key], f"{self._where(key)}: warning: {text}")
+
     def refuse_missing(self, key: str, wanted: str) -> None:
         """Report that a key is not there."""
-        self.problems.add_at(self._parent, f"{self._where(key)}: is missing; {wanted} is wanted")
+        self.problems.add_at(self._parent, f"{self._where(key)}: is missing; expected {wanted}")
 
     def refuse_unknown(self, allowed: list[str]) -> None:
         """Report each key that is not allowed here, and what was probably meant."""
@@ -273,14 +294,16 @@ class Section:
     def section(self, key: str, *, required: bool = True) -> Section | None:
         """Return a section below; None, reported, if it is missing or not a mapping."""
         path = self._below(key)
-        wanted = f"a section with {', '.join(key_names(self._schemas[path]))}"
+        schema = self._schemas[path]
+        needed = [field.encode_name for field in msgspec.structs.fields(schema) if field.required]
+        wanted = f"a section with {', '.join(needed or key_names(schema))}"
         node = self.nodes.get(key)
         if node is None:
             self.refuse_missing(key, wanted)
         elif self._is_usable(key, wanted, required=required):
             if isinstance(node, MappingNode):
                 return Section(node, self._schemas, self.problems, path=path, parent=self.keys[key])
-            self.refuse_value(key, f"{wanted} is wanted, not {describe(node)}")
+            self.refuse_value(key, f"expected {wanted}, got {describe(node)}")
         return None
 
     def read(self, schema: type[Struct], *, unknown_keys: bool = False) -> dict[str, Any]:
@@ -308,7 +331,7 @@ class Section:
         if isinstance(node, ScalarNode):
             value = node.value if is_text else scalar_value(node)
             if is_text and not node.value.isprintable():
-                self.refuse_value(key, f"{wanted} is wanted, without unprintable characters")
+                self.refuse_value(key, f"expected {wanted}, without unprintable characters")
                 return
             try:
                 self.values[field.name] = msgspec.convert(value, type_)
@@ -316,13 +339,13 @@ class Section:
                 pass
             else:
                 return
-        self.refuse_value(key, f"{wanted} is wanted, not {describe(node, number_wanted=is_number)}")
+        self.refuse_value(key, f"expected {wanted}, got {describe(node, number_wanted=is_number)}")
 
     def _is_usable(self, key: str, wanted: str, *, required: bool) -> bool:
         if tag := foreign_tag(self.nodes[key]):
             self.refuse_value(key, f"the YAML tag {tag} means nothing here; remove it")
         elif is_empty(self.nodes[key]):
-            self.refuse_value(key, f"is empty; {wanted} is wanted{'' if required else ', or remove the key'}")
+            self.refuse_value(key, f"is empty; expected {wanted}{'' if required else ', or remove the key'}")
         else:
             return True
         return False

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import can
 
 from bridged.buses import LOST_ERROR_FRAMES
+from bridged.buses.backends import missing_package
 from bridged.buses.socketcan import receive_stamped, set_buffers
 from bridged.errors import BusError
 from bridged.pump import POLL_INTERVAL_S, Pump
@@ -61,6 +62,8 @@ def open_python_can(interface: str, channel: str, options: Mapping[str, object])
         raise BusError(f"python-can {can.__version__} knows no interface {interface!r}; it knows {known}")
     if options.get("receive_own_messages"):
         raise BusError(f"{interface}: receive_own_messages would send every frame back to where it came from")
+    if text := missing_package(interface):
+        raise BusError(text)
     arguments: dict[str, Any] = {**options, "receive_own_messages": False}
     try:
         bus = can.Bus(interface=interface, channel=channel or None, **arguments)

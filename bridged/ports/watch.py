@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from bridged.errors import PortError
+from bridged.port_names import is_numbered_terminal
 from bridged.ports import sysfs
 
 _SYS: Final = Path("/sys")
@@ -168,11 +169,6 @@ class Watch:
                     break
                 some_lost = some_lost or error.errno == errno.ENOBUFS
         return events, some_lost
-
-
-def is_numbered_terminal(port: str) -> bool:
-    """Whether it is /dev/pts/N itself, and no link to it: a name that the kernel uses again and again."""
-    return re.fullmatch(r"/dev/pts/\d+", os.path.normpath(port)) is not None
 
 
 def _identity(terminal: os.stat_result) -> tuple[int, int]:

@@ -309,22 +309,22 @@ def test_bit_timing_by_python_can(file: Path, channel: str, timing: BitTiming) -
 
 # --- What does not ---------------------------------------------------------------------------------
 
-PORT = "a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT is wanted"
-URL = "HOST:PORT with a PORT from 1 to 65535 is wanted, not"
-BAUDRATE = "a UART rate from 50 to 4000000 bit/s is wanted"
-BITRATE = "a bit rate from 10000 to 1000000 bit/s (a slower one by btr0 and btr1) is wanted"
-REGISTER = "a register value from 0x00 to 0xFF is wanted"
-RESTART = "a number of milliseconds from 1 to 60000, or never is wanted"
-SAMPLE_POINT = "a fraction of the bit time from 0.5 to 0.95 is wanted"
-WORD = "a number from 0x00000000 to 0xFFFFFFFF is wanted"
+PORT = "expected a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT"
+URL = "HOST:PORT with a PORT from 1 to 65535, got"
+BAUDRATE = "expected a UART rate from 50 to 4000000 bit/s"
+BITRATE = "expected a bit rate from 10000 to 1000000 bit/s (a slower one by btr0 and btr1)"
+REGISTER = "expected a register value from 0x00 to 0xFF"
+RESTART = "expected a number of milliseconds from 1 to 60000, or never"
+SAMPLE_POINT = "expected a fraction of the bit time from 0.5 to 0.95"
+WORD = "expected a number from 0x00000000 to 0xFFFFFFFF"
 NAME = "the name of an interface has"
-PAUSE = "a number of seconds from 0.01 to 3600 is wanted"
-DEADLINE = "a number of seconds above 0 and up to 3600 is wanted"
-USB = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, is wanted, not"
-CRITICAL = "a number of frames from 2 to 18 is wanted"
-READY = "a number of frames from 1 to 17 is wanted"
-SERIAL_NUMBER = "the serial number that the device reports is wanted"
-SINGLE = "a single value, or a list of single values, is wanted"
+PAUSE = "expected a number of seconds from 0.01 to 3600"
+DEADLINE = "expected a number of seconds above 0 and up to 3600"
+USB = "expected usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each, got"
+CRITICAL = "expected a number of frames from 2 to 18"
+READY = "expected a number of frames from 1 to 17"
+SERIAL_NUMBER = "expected the serial number that the device reports"
+SINGLE = "expected a single value, or a list of single values"
 
 
 @pytest.mark.parametrize(
@@ -332,43 +332,43 @@ SINGLE = "a single value, or a list of single values, is wanted"
     [
         (port, "ttyUSB0", "a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not"),
         (port, "3", "a device path begins with '/', such as /dev/ttyUSB0; '3' does not"),
-        (port, "''", f"{PORT}, not the text ''"),
-        (port, "{a: b}", f"{PORT}, not a mapping"),
+        (port, "''", f"{PORT}, got the text ''"),
+        (port, "{a: b}", f"{PORT}, got a mapping"),
         (port, '"/dev/\\0"', f"{PORT}, without unprintable characters"),
         (port, '"/dev/\\ud800"', f"{PORT}, without unprintable characters"),
         (port, "loop://", "the URL of a port begins with socket:// or rfc2217://, not 'loop://'"),
-        (port, "socket://host", f"socket://{URL} 'socket://host'"),
-        (port, "socket://host:0", f"socket://{URL} 'socket://host:0'"),
-        (port, "rfc2217://host:65536", f"rfc2217://{URL} 'rfc2217://host:65536'"),
-        (port, "socket://:4001", f"socket://{URL} 'socket://:4001'"),
-        (port, "socket://a..b:1", f"socket://{URL} 'socket://a..b:1'"),
-        (port, "socket://größe:1", f"socket://{URL} 'socket://größe:1'"),
-        (adapter, "baudrate: fast", f"{BAUDRATE}, not the text 'fast'"),
-        (adapter, "baudrate: 1e6", f"{BAUDRATE}, not the text '1e6' (write 1000000)"),
-        (adapter, "baudrate: '57600'", f"{BAUDRATE}, not the text '57600' (write 57600, without quotes)"),
-        (adapter, "baudrate: !!str 9600", f"{BAUDRATE}, not the text '9600' (write 9600)"),
-        (adapter, "baudrate: 057600", f"{BAUDRATE}, not the text '057600' (write 57600)"),
-        (adapter, "baudrate: 0o17", f"{BAUDRATE}, not the text '0o17' (write 15)"),
-        (adapter, "baudrate: 12:30", f"{BAUDRATE}, not the text '12:30'"),
-        (adapter, "baudrate: 57600.0", f"{BAUDRATE}, not 57600.0"),
-        (adapter, "baudrate: yes", f"{BAUDRATE}, not the yes-or-no value 'yes'"),
-        (adapter, "baudrate: 2026-01-02", f"{BAUDRATE}, not the text '2026-01-02'"),
-        (adapter, "baudrate: 49", f"{BAUDRATE}, not 49"),
-        (adapter, "baudrate: -9600", f"{BAUDRATE}, not -9600"),
-        (adapter, "baudrate: 1" + "0" * 50, f"{BAUDRATE}, not 1{'0' * 39}…"),
-        (adapter, "baudrate: " + "9" * 5000, f"{BAUDRATE}, not the text '{'9' * 40}…'"),
-        (adapter, "baudrate: !!int x", f"{BAUDRATE}, not the text 'x'"),
-        (adapter, "baudrate: !!bool x", f"{BAUDRATE}, not the text 'x'"),
+        (port, "socket://host", f"expected socket://{URL} 'socket://host'"),
+        (port, "socket://host:0", f"expected socket://{URL} 'socket://host:0'"),
+        (port, "rfc2217://host:65536", f"expected rfc2217://{URL} 'rfc2217://host:65536'"),
+        (port, "socket://:4001", f"expected socket://{URL} 'socket://:4001'"),
+        (port, "socket://a..b:1", f"expected socket://{URL} 'socket://a..b:1'"),
+        (port, "socket://größe:1", f"expected socket://{URL} 'socket://größe:1'"),
+        (adapter, "baudrate: fast", f"{BAUDRATE}, got the text 'fast'"),
+        (adapter, "baudrate: 1e6", f"{BAUDRATE}, got the text '1e6' (write 1000000)"),
+        (adapter, "baudrate: '57600'", f"{BAUDRATE}, got the text '57600' (write 57600, without quotes)"),
+        (adapter, "baudrate: !!str 9600", f"{BAUDRATE}, got the text '9600' (write 9600)"),
+        (adapter, "baudrate: 057600", f"{BAUDRATE}, got the text '057600' (write 57600)"),
+        (adapter, "baudrate: 0o17", f"{BAUDRATE}, got the text '0o17' (write 15)"),
+        (adapter, "baudrate: 12:30", f"{BAUDRATE}, got the text '12:30'"),
+        (adapter, "baudrate: 57600.0", f"{BAUDRATE}, got 57600.0"),
+        (adapter, "baudrate: yes", f"{BAUDRATE}, got the yes-or-no value 'yes'"),
+        (adapter, "baudrate: 2026-01-02", f"{BAUDRATE}, got the text '2026-01-02'"),
+        (adapter, "baudrate: 49", f"{BAUDRATE}, got 49"),
+        (adapter, "baudrate: -9600", f"{BAUDRATE}, got -9600"),
+        (adapter, "baudrate: 1" + "0" * 50, f"{BAUDRATE}, got 1{'0' * 39}…"),
+        (adapter, "baudrate: " + "9" * 5000, f"{BAUDRATE}, got the text '{'9' * 40}…'"),
+        (adapter, "baudrate: !!int x", f"{BAUDRATE}, got the text 'x'"),
+        (adapter, "baudrate: !!bool x", f"{BAUDRATE}, got the text 'x'"),
         (adapter, "baudrate: !!binary aGk=", "the YAML tag '!!binary' means nothing here; remove it"),
         (adapter, "baudrate: null", f"is empty; {BAUDRATE}, or remove the key"),
-        (adapter, "serial_number: A 1", f"{SERIAL_NUMBER}, not the text 'A 1'"),
+        (adapter, "serial_number: A 1", f"{SERIAL_NUMBER}, got the text 'A 1'"),
         (port, "usb://0403:6001", "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"),
         (port, "usb://", "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"),
         (usb2can_port, "ttyUSB0", "a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not"),
-        (usb2can_port, "usb:0403:6001", "a device path begins with '/', such as /dev/ttyUSB0; 'usb:0403:6001' does not"),
-        (usb2can_port, "rfc2217://host:4001", "rfc2217:// sets the baud rate of a serial line, and a FT245 has none; write socket://"),
+        (usb2can_port, "usb:0403:6001", "a URL has '//' behind the colon: usb://0403:6001"),
+        (usb2can_port, "rfc2217://host:4001", "rfc2217:// sets the baud rate of a serial line, and a USB2CAN has none; write socket://"),
         (usb2can_port, "USB://0403:6001", "the URL of a port begins with socket:// or usb://, not 'USB://'"),
-        (usb2can_port, "socket://host", f"socket://{URL} 'socket://host'"),
+        (usb2can_port, "socket://host", f"expected socket://{URL} 'socket://host'"),
         (usb2can_port, "usb://", f"{USB} 'usb://'"),
         (usb2can_port, "usb://403:6001", f"{USB} 'usb://403:6001'"),
         (usb2can_port, "usb://0x0403:0x6001", f"{USB} 'usb://0x0403:0x6001'"),
@@ -378,47 +378,47 @@ SINGLE = "a single value, or a list of single values, is wanted"
         (usb2can_port, "usb://0403:6001/ö", f"{USB} 'usb://0403:6001/ö'"),
         (usb2can_port, "usb://٠٤٠٣:6001", f"{USB} 'usb://٠٤٠٣:6001'"),
         (usb2can_port, "usb://0403:6001/" + "A" * 33, f"{USB} 'usb://0403:6001/{'A' * 24}…'"),
-        (usb2can, "serial_number: A 1", f"{SERIAL_NUMBER}, not the text 'A 1'"),
-        (usb2can, "critical_limit: 1", f"{CRITICAL}, not 1"),
-        (usb2can, "critical_limit: 19", f"{CRITICAL}, not 19"),
-        (usb2can, "ready_limit: 16, critical_limit: 15.5", f"{CRITICAL}, not 15.5"),
-        (usb2can, "critical_limit: 2, ready_limit: 18", f"{READY}, not 18"),
-        (usb2can, "ready_limit: 0", f"{READY}, not 0"),
-        (usb2can, "ready_limit: off", f"{READY}, not the yes-or-no value 'off'"),
+        (usb2can, "serial_number: A 1", f"{SERIAL_NUMBER}, got the text 'A 1'"),
+        (usb2can, "critical_limit: 1", f"{CRITICAL}, got 1"),
+        (usb2can, "critical_limit: 19", f"{CRITICAL}, got 19"),
+        (usb2can, "ready_limit: 16, critical_limit: 15.5", f"{CRITICAL}, got 15.5"),
+        (usb2can, "critical_limit: 2, ready_limit: 18", f"{READY}, got 18"),
+        (usb2can, "ready_limit: 0", f"{READY}, got 0"),
+        (usb2can, "ready_limit: off", f"{READY}, got the yes-or-no value 'off'"),
         (usb2can, "ready_limit: null", f"is empty; {READY}, or remove the key"),
-        (usb2can, "critical_limit: 7", "a limit above ready_limit (7, its default) is wanted, not 7"),
-        (usb2can, "ready_limit: 15", "a limit below critical_limit (15, its default) is wanted, not 15"),
-        (usb2can, "critical_limit: 0x0A, ready_limit: 10", "a limit below critical_limit (10) is wanted, not 10"),
+        (usb2can, "critical_limit: 7", "expected a limit above ready_limit (7, its default), got 7"),
+        (usb2can, "ready_limit: 15", "expected a limit below critical_limit (15, its default), got 15"),
+        (usb2can, "critical_limit: 0x0A, ready_limit: 10", "expected a limit below critical_limit (10), got 10"),
         (channel, "bitrate: 123456", "123456 bit/s cannot be reached with the adapter's 16 MHz clock; nearest is 123077 bit/s; or give btr0 and btr1"),
-        (channel, "bitrate: 2000000", f"{BITRATE}, not 2000000"),
-        (channel, "bitrate: 5000", f"{BITRATE}, not 5000"),
-        (channel, "bitrate: 125k", f"{BITRATE}, not the text '125k'"),
+        (channel, "bitrate: 2000000", f"{BITRATE}, got 2000000"),
+        (channel, "bitrate: 5000", f"{BITRATE}, got 5000"),
+        (channel, "bitrate: 125k", f"{BITRATE}, got the text '125k'"),
         (channel, "btr1: 0x11, btr0: 0", "btr0 0x00 with btr1 0x11 makes 1600000 bit/s; CAN ends at 1000000"),
-        (channel, "btr1: 0x1C, btr0: 0x100", f"{REGISTER}, not 0x100"),
-        (channel, "btr0: 0x03, btr1: 1C", f"{REGISTER}, not the text '1C'"),
-        (channel, "bitrate: 125000, sample_point: 87.5", f"{SAMPLE_POINT}, not 87.5"),
-        (channel, "bitrate: 125000, sample_point: .nan", f"{SAMPLE_POINT}, not the text '.nan'"),
-        (channel, "bitrate: 125000, listen_only: 1", "true or false is wanted, not 1"),
-        (channel, "bitrate: 125000, restart: 0", f"{RESTART}, not 0"),
-        (channel, "bitrate: 125000, restart: 60001", f"{RESTART}, not 60001"),
-        (channel, "bitrate: 125000, restart: 1.5", f"{RESTART}, not 1.5"),
-        (channel, "bitrate: 125000, restart: off", f"{RESTART}, not the yes-or-no value 'off'"),
-        (channel, "bitrate: 125000, restart: 100 ms", f"{RESTART}, not the text '100 ms'"),
-        (channel, "bitrate: 125000, acceptance: 3", "a section with code, mask, mode is wanted, not 3"),
+        (channel, "btr1: 0x1C, btr0: 0x100", f"{REGISTER}, got 0x100"),
+        (channel, "btr0: 0x03, btr1: 1C", f"{REGISTER}, got the text '1C'"),
+        (channel, "bitrate: 125000, sample_point: 87.5", f"{SAMPLE_POINT}, got 87.5"),
+        (channel, "bitrate: 125000, sample_point: .nan", f"{SAMPLE_POINT}, got the text '.nan'"),
+        (channel, "bitrate: 125000, listen_only: 1", "expected true or false, got 1"),
+        (channel, "bitrate: 125000, restart: 0", f"{RESTART}, got 0"),
+        (channel, "bitrate: 125000, restart: 60001", f"{RESTART}, got 60001"),
+        (channel, "bitrate: 125000, restart: 1.5", f"{RESTART}, got 1.5"),
+        (channel, "bitrate: 125000, restart: off", f"{RESTART}, got the yes-or-no value 'off'"),
+        (channel, "bitrate: 125000, restart: 100 ms", f"{RESTART}, got the text '100 ms'"),
+        (channel, "bitrate: 125000, acceptance: 3", "expected a section with code, mask, got 3"),
         (bus, "channel: a234567890123456", f"{NAME} up to 15 characters, 'a234567890123456' has 16"),
         (bus, "channel: größe-größe-1", f"{NAME} up to 15 characters, 'größe-größe-1' has 17"),
         (bus, "channel: /dev/can", f"{NAME} no '/', ':' or space; '/dev/can' is none"),
         (bus, "channel: ..", f"{NAME} no '/', ':' or space; '..' is none"),
-        (bus, "channel: x, interface: a b", "socketcan or the name of another python-can interface is wanted, not the text 'a b'"),
+        (bus, "channel: x, interface: a b", "expected socketcan or the name of another python-can interface, got the text 'a b'"),
         (bus, "interface: virtual, channel: x, create: yes", "only an interface of socketcan can be created; remove it"),
-        (transmit, "window: 33", "a number of unanswered frames from 1 to 32 is wanted, not 33"),
-        (transmit, "deadline: 0", f"{DEADLINE}, not 0"),
-        (transmit, "deadline: .inf", f"{DEADLINE}, not the text '.inf'"),
-        (transmit, "deadline: 1e-1", f"{DEADLINE}, not the text '1e-1' (write 0.1)"),
-        (transmit, "deadline: 1e-9", f"{DEADLINE}, not the text '1e-9'"),
-        (transmit, "deadline: 1:30.5", f"{DEADLINE}, not the text '1:30.5'"),
-        (reconnect, "maximum: 0", f"{PAUSE}, not 0"),
-        (reconnect, "initial: 3601", f"{PAUSE}, not 3601"),
+        (transmit, "window: 33", "expected a number of unanswered frames from 1 to 32, got 33"),
+        (transmit, "deadline: 0", f"{DEADLINE}, got 0"),
+        (transmit, "deadline: .inf", f"{DEADLINE}, got the text '.inf'"),
+        (transmit, "deadline: 1e-1", f"{DEADLINE}, got the text '1e-1' (write 0.1)"),
+        (transmit, "deadline: 1e-9", f"{DEADLINE}, got the text '1e-9'"),
+        (transmit, "deadline: 1:30.5", f"{DEADLINE}, got the text '1:30.5'"),
+        (reconnect, "maximum: 0", f"{PAUSE}, got 0"),
+        (reconnect, "initial: 3601", f"{PAUSE}, got 3601"),
         (reconnect, "initial: 5.1", "initial (5.1 s) is more than maximum (5 s)"),
         (reconnect, "initial: 2, maximum: 1", "initial (2 s) is more than maximum (1 s)"),
     ],
@@ -441,7 +441,7 @@ CAN232_KEYS = "type, port, baudrate, serial_number, firmware"
 USB2CAN_KEYS = "type, port, serial_number, critical_limit, ready_limit"
 CHANNEL_KEYS = "bitrate, btr0, btr1, sample_point, listen_only, acceptance, restart"
 BUS_KEYS = "interface, channel, create"
-SECTIONS = "sections adapter, channel and bus are wanted"
+SECTIONS = "expected sections adapter, channel and bus"
 NO_MAPPING = f"the file is no mapping (a 'key: value' in each line); {SECTIONS}"
 
 CASES: dict[str, tuple[str | bytes, list[str]]] = {
@@ -459,21 +459,21 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
          "so they could be sent late; at most 4"],
     ),
     "no sections": ("{}", [
-        f"1:1: adapter: is missing; a section with {ADAPTER_KEYS} is wanted",
-        f"1:1: channel: is missing; a section with {CHANNEL_KEYS} is wanted",
-        f"1:1: bus: is missing; a section with {BUS_KEYS} is wanted",
+        "1:1: adapter: is missing; expected a section with type, port",
+        f"1:1: channel: is missing; expected a section with {CHANNEL_KEYS}",
+        "1:1: bus: is missing; expected a section with channel",
     ]),
     "sections that are none": ("adapter: can232\nchannel: [1]\nbus:\ntransmit: ~\n", [
-        f"1:10: adapter: a section with {ADAPTER_KEYS} is wanted, not the text 'can232'",
-        f"2:10: channel: a section with {CHANNEL_KEYS} is wanted, not a list",
-        f"3:5: bus: is empty; a section with {BUS_KEYS} is wanted",
-        "4:11: transmit: is empty; a section with queue, window, deadline is wanted, or remove the key",
+        "1:10: adapter: expected a section with type, port, got the text 'can232'",
+        f"2:10: channel: expected a section with {CHANNEL_KEYS}, got a list",
+        "3:5: bus: is empty; expected a section with channel",
+        "4:11: transmit: is empty; expected a section with queue, window, deadline, or remove the key",
     ]),
     "empty sections": ("adapter: {}\nchannel: {}\nbus: {}\n", [
-        "1:1: adapter.type: is missing; can232 or usb2can is wanted",
+        "1:1: adapter.type: is missing; expected can232 or usb2can",
         f"1:1: adapter.port: is missing; {PORT}",
-        "2:1: channel.bitrate: is missing; a bit rate in bit/s (or btr0 and btr1) is wanted",
-        "3:1: bus.channel: is missing; the name of an interface is wanted",
+        "2:1: channel.bitrate: is missing; expected a bit rate in bit/s (or btr0 and btr1)",
+        "3:1: bus.channel: is missing; expected the name of an interface",
     ]),
     # keys
     "unknown": ("adapter:\n  type: can232\n  port: /dev/x\n  baud: 1\nchannel: {bitrate: 125000}\nbus: {channel: vcan0, loop: true}\ntransmitt: {}\n1: 2\n", [
@@ -520,29 +520,34 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "1:56: adapter.critical_limit: goes with type: usb2can; remove it",
         "1:76: adapter.critical_limit: given twice, first in line 1; remove one",
     ]),
-    "baudrate of usb2can": (usb2can("baudrate: fast"), ["1:40: adapter.baudrate: a FT245 has no baud rate: remove it"]),
-    "type": (four_lines("{type: slcan, port: 'usb://1', baudrate: 49, ready_limit: 18, x: 1}"), [
-        "1:17: adapter.type: can232 or usb2can is wanted, not the text 'slcan'",
-        f"1:30: adapter.port: {USB} 'usb://1'",
-        f"1:51: adapter.baudrate: {BAUDRATE}, not 49",
-        f"1:68: adapter.ready_limit: {READY}, not 18",
-        f"1:72: adapter.x: unknown key; allowed here: {ADAPTER_KEYS}",
+    "baudrate of usb2can": (usb2can("baudrate: fast"), ["1:40: adapter.baudrate: a USB2CAN has no baud rate, there is no serial line in it: remove it"]),
+    "type": (four_lines("{type: can231, port: 'usb://1', baudrate: 49, ready_limit: 18, x: 1}"), [
+        "1:17: adapter.type: expected can232 or usb2can, got the text 'can231'",
+        f"1:31: adapter.port: {USB} 'usb://1'",
+        f"1:52: adapter.baudrate: {BAUDRATE}, got 49",
+        f"1:69: adapter.ready_limit: {READY}, got 18",
+        f"1:73: adapter.x: unknown key; allowed here: {ADAPTER_KEYS}",
+    ]),
+    "type, of the protocol": (four_lines("{type: slcan, port: 'usb://1', ready_limit: 18}"), [
+        "1:17: adapter.type: a CAN232 speaks what 'slcan' names, LAWICEL's protocol: write type: can232",
+        "1:30: adapter.port: usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0",
+        "1:41: adapter.ready_limit: goes with type: usb2can; remove it",
     ]),
     "type, no text": (four_lines("{type: [usb2can], port: tcp://h}"), [
-        "1:17: adapter.type: can232 or usb2can is wanted, not a list",
-        "1:34: adapter.port: the URL of a port begins with socket:// or rfc2217:// or usb://, not 'tcp://'",
+        "1:17: adapter.type: expected can232 or usb2can, got a list",
+        "1:34: adapter.port: a raw TCP port is written 'socket://h'",
     ]),
     "type with a tag": (four_lines("{type: !x usb2can, port: /dev/x, baudrate: 1}"), [
         "1:17: adapter.type: the YAML tag '!x' means nothing here; remove it",
-        "1:43: adapter.baudrate: a FT245 has no baud rate: remove it",
+        "1:43: adapter.baudrate: a USB2CAN has no baud rate, there is no serial line in it: remove it",
     ]),
     "no type": (four_lines("{port: 'rfc2217://h:0'}"), [
-        "1:1: adapter.type: is missing; can232 or usb2can is wanted",
-        f"1:17: adapter.port: rfc2217://{URL} 'rfc2217://h:0'",
+        "1:1: adapter.type: is missing; expected can232 or usb2can",
+        f"1:17: adapter.port: expected rfc2217://{URL} 'rfc2217://h:0'",
     ]),
     "usb2can without a port": (four_lines("{type: usb2can, ready_limit: 2, critical_limit: 2, serial_number: A}"), [
         f"1:1: adapter.port: is missing; {PORT}",
-        "1:39: adapter.ready_limit: a limit below critical_limit (2) is wanted, not 2",
+        "1:39: adapter.ready_limit: expected a limit below critical_limit (2), got 2",
     ]),
     "another serial number": (usb2can_port("'usb://0403:6001/A1', serial_number: a1"), [
         "1:69: adapter.serial_number: 'a1' is not the one in port, 'A1'; remove one of them",
@@ -554,13 +559,13 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "1:46: adapter.serial_number: is the USB device's, unknown through socket://; remove it",
     ]),
     "usb2can, transmit": (four_lines("{type: usb2can, port: /dev/x}", more="transmit: {window: 0}"), [
-        "4:20: transmit.window: a number of unanswered frames from 1 to 32 is wanted, not 0",
+        "4:20: transmit.window: expected a number of unanswered frames from 1 to 32, got 0",
     ]),
     # combinations
     "several in a section": (four_lines("{type: can231, port: ttyUSB0, baudrate: 1.5}"), [
-        "1:17: adapter.type: can232 or usb2can is wanted, not the text 'can231'",
+        "1:17: adapter.type: expected can232 or usb2can, got the text 'can231'",
         "1:31: adapter.port: a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not",
-        f"1:50: adapter.baudrate: {BAUDRATE}, not 1.5",
+        f"1:50: adapter.baudrate: {BAUDRATE}, got 1.5",
     ]),
     "bitrate and btr": (channel("bitrate: 125000, btr1: 0x1C, btr0: 0x03"), ["2:40: channel.btr0: excludes bitrate; give bitrate, or btr0 and btr1"]),
     "half a pair": (channel("btr1: 3"), ["2:11: channel.btr1: is half of a pair; give both btr0 and btr1, or bitrate"]),
@@ -569,23 +574,23 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     ]),
     "acceptance": (channel("bitrate: 125000, acceptance: {code: 0x100000000, mode: both, x: 1}"), [
         f"2:28: channel.acceptance.mask: is missing; {WORD}",
-        f"2:47: channel.acceptance.code: {WORD}, not 0x100000000",
-        "2:66: channel.acceptance.mode: dual or single is wanted, not the text 'both'",
+        f"2:47: channel.acceptance.code: {WORD}, got 0x100000000",
+        "2:66: channel.acceptance.mode: expected dual or single, got the text 'both'",
         "2:72: channel.acceptance.x: unknown key; allowed here: code, mask, mode",
     ]),
     "acceptance, signs and quotes": (channel("bitrate: 125000, acceptance: {code: -1, mask: '0x1FF0'}"), [
-        f"2:47: channel.acceptance.code: {WORD}, not -1",
-        f"2:57: channel.acceptance.mask: {WORD}, not the text '0x1FF0' (write 0x1ff0, without quotes)",
+        f"2:47: channel.acceptance.code: {WORD}, got -1",
+        f"2:57: channel.acceptance.mask: {WORD}, got the text '0x1FF0' (write 0x1ff0, without quotes)",
     ]),
     "transmit when listening": (four_lines(channel="{bitrate: 125000, listen_only: true}", more="transmit: {queue: 0}"), [
         "4:1: transmit: nothing is sent with channel.listen_only: true; remove this section, or listen_only",
-        "4:19: transmit.queue: a number of frames from 1 to 65536 is wanted, not 0",
+        "4:19: transmit.queue: expected a number of frames from 1 to 65536, got 0",
     ]),
     "options": (bus("interface: virtual, channel: x, a: {b: c}, d: [[]], e: &e [*e], f-g: 1, bustype: x, h: !x 1, i: [!y z]"), [
         f"3:42: bus.a: {SINGLE}",
         f"3:53: bus.d: {SINGLE}",
         f"3:62: bus.e: {SINGLE}",
-        "3:71: bus.f-g: unknown key; the name of an option is wanted, such as hop_limit",
+        "3:71: bus.f-g: unknown key; expected the name of an option, such as hop_limit",
         "3:79: bus.bustype: cannot be given; write interface",
         "3:94: bus.h: the YAML tag '!x' means nothing here; remove it",
         "3:103: bus.i: the YAML tag '!y' means nothing here; remove it",
@@ -601,9 +606,9 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "3:7: bus: a key is a single word",
     ]),
     "recursive": ("&r {adapter: {type: can232, port: *r}, channel: {bitrate: 125000}, bus: *r}", [
-        f"1:1: adapter.port: {PORT}, not a mapping",
+        f"1:1: adapter.port: {PORT}, got a mapping",
         f"1:5: bus.adapter: unknown key; allowed here: {BUS_KEYS}",
-        "1:49: bus.channel: the name of an interface is wanted, not a mapping",
+        "1:49: bus.channel: expected the name of an interface, got a mapping",
         f"1:68: bus.bus: unknown key; allowed here: {BUS_KEYS}",
     ]),
     # YAML
