@@ -167,7 +167,7 @@ def _status_paths(args: argparse.Namespace) -> list[Path]:
 
 
 def _seen() -> str:
-    return "" if os.geteuid() == 0 else " (but for other users' bridges, which only they can see)"
+    return "" if os.geteuid() == 0 else " (only your bridges and root's are seen)"
 
 
 def _not_running(name: str) -> str:

@@ -103,9 +103,7 @@ class TestStatus:
             (run / "a.sock").rename(run / "can232.sock")  # and the one that ends does not find it
         assert said("can232") == said() == f"can-bridge: can232 is not running: {hint}\n"
         monkeypatch.setattr(os, "geteuid", lambda: 1000)
-        assert "is not running (but for other users' bridges, which only they can see): start" in said(
-            "can232"
-        )
+        assert "is not running (only your bridges and root's are seen): start" in said("can232")
 
     @pytest.mark.usefixtures("configs")
     def test_a_watch_outlives_the_bridge(

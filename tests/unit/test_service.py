@@ -145,6 +145,16 @@ class TestProcess:
         last = r" one: stopped after \d s: 0 frames received, 0 sent; none dropped; no adapter was reached$"
         assert re.search(last, lines[-1])
 
+    def test_a_stop_ends_well_whatever_comes_after_it(
+        self, tmp_path: Path, systemd: Systemd, start: Callable[..., subprocess.Popen[str]]
+    ) -> None:
+        process = start(write_config(tmp_path / "one.yaml"))
+        systemd.wait_for("STATUS=waiting: ")
+        process.terminate()
+        while process.poll() is None:
+            process.send_signal(signal.SIGHUP)
+        assert process.returncode == 0
+
     @pytest.mark.parametrize(
         ("redirect", "closed"), [("2>&-", (2,)), ("2>/dev/full", ()), ("0<&- 1>&- 2>&-", (0, 1, 2))]
     )
