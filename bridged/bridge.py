@@ -45,6 +45,11 @@ UNANSWERED_LOG_S = 10.0
 LAST_WORDS_S = 0.1
 STOP_S = 1.2  # for an adapter that does not answer; systemd and users wait for the end
 
+HAND_OVER_S = 1.0  # for frames that wait when another bridge is to take this one's place
+HAND_OVER_LOOK_S = 0.005
+
+# States before the adapter runs for the first time.
+COMING_UP = (State.IDLE, State.OPENING, State.INITIALISING)
 # States that end at once when the device is plugged in.
 LOOKING_OUT = (State.WAITING, State.BACKOFF, State.FAULT)
 # What the adapter did, or did not, led to them.
@@ -57,6 +62,14 @@ def _reason(error: int) -> str:
     if error == errno.ETIME:
         return "it took no bytes for too long, and what waited must not be sent late"
     return os.strerror(error) if error else "end of file or hang-up"
+
+
+def _sum(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Counters that go on: of a bridge and those before it, some by reason."""
+    total = dict(now)
+    for name, n in before.items():
+        total[name] = _sum(n, now.get(name, {})) if isinstance(n, dict) else n + now.get(name, 0)
+    return total
 
 
 class Bridge:
@@ -93,6 +106,10 @@ class Bridge:
         self._identity: object = None  # that was told
         self._bus_off = BusOff(config, self.adapter, self._dispatch)
         self._unanswered_told = Told(UNANSWERED_LOG_S)
+        self._counted_before: dict[str, Any] = {}  # by the bridges of this process before this one
+        self._holds_bus = False  # its frames wait until the adapter runs, or fails to
+        self._stop_by: float | None = None  # told to stop once what was read is sent, or then
+        self._look_again_at: float | None = None  # whether it is
         self._turns: object = None  # of the relay, when they were looked at last
         sync = self.adapter.sync
         self._relay = _relay.Relay(
@@ -120,18 +137,51 @@ class Bridge:
 
     # --- for the owner ------------------------------------------------------------------------
 
-    def start(self, bus: Bus | None = None) -> None:
-        """Starts the relay; the adapter follows when the bus is open. `bus`: of a bridge that ended."""
+    def start(self, predecessor: Bridge | None = None) -> None:
+        """Starts the relay; the adapter follows when the bus is open.
+
+        `predecessor`: one that was told its successor by stop() and is settled. Its counters go on, and so does
+        its bus: frames that wait there are read once the adapter runs, or fails to.
+        """
         self._thread.start()
+        bus = None
+        if predecessor is not None:
+            bus = predecessor._hand_over_bus(self.config)
+            predecessor.close()
+            self._counted_before = predecessor.snapshot()["counters"]
+            self._started = predecessor._started
         if bus is None:
             self._bus_end.open()
         else:
+            self._holds_bus = True
+            self._relay.hold_bus(True)
             self._bus_end.use(bus)
         self._start_with_bus()
 
-    def stop(self) -> None:
-        """Closes the adapter, then everything; `finished` says when."""
+    def stop(self, successor: Config | None = None) -> None:
+        """Closes the adapter, then everything; `finished` says when.
+
+        `successor`: the configuration of the bridge that goes on. If it has the same bus, frames wait in that
+        from now on, and those that were read before are sent first, for HAND_OVER_S at most.
+        """
         self._bus_end.retry_at = None
+        hands_over = successor is not None and successor.bus == self.config.bus
+        self._holds_bus = False
+        self._relay.hold_bus(hands_over)
+        if hands_over and self.state is State.RUNNING and self._stop_by is None:
+            self._stop_by = time.monotonic() + HAND_OVER_S
+        elif not hands_over:
+            self._stop_by = None
+        self._stop_when_sent()
+
+    def _stop_when_sent(self) -> None:
+        """A bridge that hands its bus over stops when it has sent what it has read, or cannot."""
+        now = time.monotonic()
+        waits = self.state is State.RUNNING and self._relay.counters()["queued"]
+        if self._stop_by is not None and waits and now < self._stop_by:
+            self._look_again_at = now + HAND_OVER_LOOK_S
+            return
+        self._stop_by = self._look_again_at = None
         self._dispatch(Event.STOP)
 
     def filenos(self) -> tuple[int, ...]:
@@ -154,13 +204,15 @@ class Bridge:
 
     def next_timer(self) -> float | None:
         parts = (self._bus_end, self._polling, self._exchanges, self._sharing)
-        timers = (self._timer, *(part.next_at for part in parts))
+        timers = (self._timer, self._look_again_at, *(part.next_at for part in parts))
         return min((t for t in timers if t is not None), default=None)
 
     def on_timer(self, now: float) -> None:
         if self._timer is not None and self._timer <= now:
             self._timer = None
             self._dispatch(Event.TIMER)
+        if self._look_again_at is not None and self._look_again_at <= now:
+            self._stop_when_sent()
         if self._bus_end.on_timer(now):
             self._dispatch(Event.RESTART)
         self._start_with_bus()
@@ -218,6 +270,18 @@ class Bridge:
         queued = counters.pop("queued")
         identity = self.adapter.identity
         health = self._polling.health
+        counted = {
+            "rx_frames": counters.pop("rx_frames"),
+            "tx_frames": counters.pop("tx_frames"),
+            "rx_errors": counters.pop("skipped_messages"),
+            "tx_retries": counters.pop("tx_retries"),
+            "reconnects": max(0, self._starts - 1),
+            "bus_off_restarts": health.restarts,
+            **health.happened,
+            **self._bus_end.error_frames(),
+            "tx_discarded": self.adapter.discarded,
+            **counters,
+        }
         return {
             "name": self.config.name,
             "state": self.state.value,
@@ -239,18 +303,7 @@ class Bridge:
                 "channel": self.config.bus.channel,
                 "open": self._bus_end.bus is not None,
             },
-            "counters": {
-                "rx_frames": counters.pop("rx_frames"),
-                "tx_frames": counters.pop("tx_frames"),
-                "rx_errors": counters.pop("skipped_messages"),
-                "tx_retries": counters.pop("tx_retries"),
-                "reconnects": max(0, self._starts - 1),
-                "bus_off_restarts": health.restarts,
-                **health.happened,
-                **self._bus_end.error_frames(),
-                "tx_discarded": self.adapter.discarded,
-                **counters,
-            },
+            "counters": _sum(self._counted_before, counted),
             "queued": queued,
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
@@ -274,6 +327,9 @@ class Bridge:
             self._log_transition(reason)
         for action in actions:
             self._perform(action)
+        if self._holds_bus and self.state not in COMING_UP:
+            self._holds_bus = False
+            self._relay.hold_bus(False)
 
     def _log_transition(self, reason: str) -> None:
         """One line; retries, and what is repeated too often, for those who look for a fault only."""
@@ -449,8 +505,10 @@ class Bridge:
         """`finished`, and no port is being opened any more that would be in a successor's way."""
         return self.finished and not self._opening
 
-    def hand_over_bus(self) -> Bus | None:
-        """After `finished`: the open bus, for a successor's start(); None: it was lost."""
+    def _hand_over_bus(self, successor: Config) -> Bus | None:
+        """The open bus; None: it was lost, or the successor wants another."""
+        if successor.bus != self.config.bus:
+            return None
         if any(kind == _relay.EVENT_BUS_LOST for kind, _, _ in self._relay.events()):
             return None
         return self._bus_end.hand_over()

@@ -78,8 +78,9 @@ class Service:
     """Runs `bridge`, and after each SIGHUP the one that `successor` makes, or the same if that can take over
     the new configuration; without `successor` SIGHUP is a stop.
 
-    The adapter of the old one is closed before the new one opens its own. The process, the status socket and,
-    unless its section has changed, the open bus stay: frames sent meanwhile wait there.
+    The adapter of the old one is closed before the new one opens its own. The process, its counters, the
+    status socket and, unless its section has changed, the open bus stay: frames sent meanwhile wait there
+    until the new adapter runs, or fails to.
     """
 
     def __init__(
@@ -177,7 +178,7 @@ class Service:
         log.info("reload: the configuration has changed, reopening the adapter")
         self._discard_successor()
         self._successor = successor
-        self.bridge.stop()
+        self.bridge.stop(successor.config)
 
     def _discard_successor(self) -> None:
         if self._successor is not None:
@@ -188,11 +189,9 @@ class Service:
         old = self.bridge
         for fd in old.filenos():
             selector.unregister(fd)
-        bus = old.hand_over_bus() if successor.config.bus == old.config.bus else None
-        old.close()
         self.bridge, self._successor = successor, None
         self._watch(selector)
-        self.bridge.start(bus)
+        self.bridge.start(old)
         self._notifier.ready()
 
     # --- systemd ------------------------------------------------------------------------------

@@ -227,6 +227,16 @@ static PyObject *Relay_detach_bus(PyObject *self, PyObject *Py_UNUSED(ignored))
     return relay_unlock_wake(r);
 }
 
+static PyObject *Relay_hold_bus(PyObject *self, PyObject *arg)
+{
+    int held = PyObject_IsTrue(arg);
+    if (held < 0)
+        return NULL;
+    struct relay *r = relay_lock(self);
+    relay_hold_bus(r, held);
+    return relay_unlock_wake(r);
+}
+
 static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"receiving", "transmit", NULL};
@@ -403,6 +413,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"detach_port", Relay_detach_port, METH_NOARGS, NULL},
     {"attach_bus", Relay_attach_bus, METH_O, NULL},
     {"detach_bus", Relay_detach_bus, METH_NOARGS, NULL},
+    {"hold_bus", Relay_hold_bus, METH_O, NULL},
     {"set_gates", (PyCFunction)(void (*)(void))Relay_set_gates, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_queue", Relay_set_queue, METH_VARARGS, NULL},
     {"set_polling", Relay_set_polling, METH_VARARGS, NULL},

@@ -423,7 +423,26 @@ void relay_attach_bus(struct relay *r, int fd)
     unwatch(r, r->bus);
     r->bus = fd;
     r->empty = (struct moment){0}; /* frames may wait in it since the bridge before us: their stamps are believed */
-    int error = fd >= 0 ? watch(r, EPOLL_CTL_ADD, fd, BUS, EPOLLIN) : 0;
+    if (fd < 0)
+        rx_drop(r, r->rx_count, RX_BUS_LOST);
+    int error = fd >= 0 && !r->bus_held ? watch(r, EPOLL_CTL_ADD, fd, BUS, EPOLLIN) : 0;
+    if (error)
+        bus_lost(r, error);
+}
+
+/* While `held` the bus is not read, whichever is attached: its frames wait in the socket, which stamps them. Those for
+ * it go on. */
+void relay_hold_bus(struct relay *r, bool held)
+{
+    if (r->bus_held == held)
+        return;
+    r->attachments++;
+    r->bus_held = held;
+    int error = 0;
+    if (held)
+        unwatch(r, r->bus);
+    else if (r->bus >= 0)
+        error = watch(r, EPOLL_CTL_ADD, r->bus, BUS, EPOLLIN);
     if (error)
         bus_lost(r, error);
 }
@@ -484,7 +503,7 @@ static unsigned int wait_ready(struct relay *r, struct moment turn, int64_t unti
     }
     if (attachments != r->attachments)
         return 0;
-    if (n >= 0 && !(sources & BUS))
+    if (n >= 0 && !(sources & BUS) && !r->bus_held)
         r->empty = turn;
     return sources;
 }

@@ -131,6 +131,7 @@ struct relay {
     uint32_t attachments; /* counts attach and detach: results of a wait before one are void */
     enum gate gate;
     bool receiving;
+    bool bus_held; /* the bus is not read */
 
     /* bus -> device (queue.c, transmit.c) */
     struct tx_frame *queue; /* ring of set.queue */
@@ -198,6 +199,7 @@ void relay_wake(struct relay *r);
 void relay_attach_port(struct relay *r, int fd);
 void relay_detach_port(struct relay *r);
 void relay_attach_bus(struct relay *r, int fd);
+void relay_hold_bus(struct relay *r, bool held);
 void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length);
 void relay_port_lost(struct relay *r, int error);
 
