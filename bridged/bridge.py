@@ -140,7 +140,7 @@ class Bridge:
     def start(self, predecessor: Bridge | None = None) -> None:
         """Starts the relay; the adapter follows when the bus is open.
 
-        `predecessor`: one that was told its successor by stop() and is settled. Its counters go on, and so does
+        `predecessor`: one that was told its successor by stop() and is settled. Its counters go on, so does
         its bus: frames that wait there are read once the adapter runs, or fails to.
         """
         self._thread.start()
