@@ -138,7 +138,7 @@ def _check_one(path: Path) -> None:
 
     config, warnings = check(path)
     for warning in warnings:
-        print(warning, file=sys.stderr)
+        print(printable(warning), file=sys.stderr)
     adapter, channel, bus = config.adapter, config.channel, config.bus
     rate = f" at {adapter.baudrate} Bd" if adapter.type == "can232" else ""
     print(
@@ -323,7 +323,7 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
     )
 
     simulate = add(
-        "simulate", "Simulate an adapter on a pseudo terminal, or on a line that is there.", _simulate
+        "simulate", "Simulate an adapter on a pseudo terminal, or on an existing device or socket.", _simulate
     )
     if command == "simulate":
         from bridged.simulators import commands as simulators  # noqa: PLC0415

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any
 import can
 
 from bridged.bridge import Bridge
-from bridged.buses.socketcan import open_socketcan
+from bridged.buses.socketcan import NO_CAN, open_socketcan
 from bridged.config import load
 from bridged.errors import BusError
 from bridged.memory import FileMemory
 from bridged.service import serve
 from bridged.simulators.can232 import Can232
 from bridged.simulators.commands import ADAPTERS, STOP_GRACE_S, positive
-from bridged.simulators.serve import Simulator
+from bridged.simulators.serve import Simulator, cyclic_frames
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 CHANNEL = "vcan0"
 UART_RATE = 115_200
 STATUS_INTERVAL_S = 1.0
+CLOSED = ("closed", "config")  # what the two adapters call it
 CONFIG = """\
 adapter:
   type: {adapter}
@@ -126,7 +127,8 @@ def _interface() -> tuple[str, str]:
     try:
         open_socketcan(CHANNEL, create=True).close()
     except BusError as error:
-        print(f"# No {CHANNEL} here: {error}")
+        cause = NO_CAN if str(error).startswith(NO_CAN) else error  # what helps is not for a demo
+        print(f"# No {CHANNEL} here: {cause}.")
         print("# So the frames stay inside this process: python-can's interface 'virtual'.")
         return "virtual", "demo"
     print(f"# Interface {CHANNEL}: look on from another terminal with `candump {CHANNEL}`.")
@@ -193,7 +195,7 @@ def _end_serving() -> None:
 def run(args: argparse.Namespace) -> int:
     """The demo; 0 if frames went both ways."""
     device, baudrate = _make_device(args.adapter)
-    simulator = Simulator(device, traffic_fps=args.rate)
+    simulator = Simulator(device, traffic_fps=args.rate, traffic=cyclic_frames(random.Random(0)))
     rate = f" at {UART_RATE} Bd" if baudrate else ""
     print(f"# Simulated {args.adapter.upper()} on {simulator.port}{rate}, bit rate 125 kbit/s.")
     thread = threading.Thread(target=simulator.run)
@@ -222,8 +224,11 @@ def run(args: argparse.Namespace) -> int:
             simulator.stop()
             thread.join()
     counters = bridge.snapshot()["counters"]
+    confirmed = counters["tx_frames"]
     print(
-        f"# Done: {program.received} frames from the adapter seen on {channel}, {program.sent} sent to it, "
-        f"of which it confirmed {counters['tx_frames']}. Adapter closed: {device.state.value}."
+        f"# Done: received {program.received} frames on {channel}, sent {program.sent}, "
+        f"{'all' if confirmed == program.sent else confirmed} confirmed by the adapter. Its channel is "
+        f"{'closed' if device.state.value in CLOSED else device.state.value}."
     )
+    print("# With an adapter of your own: see First configuration in the README.")
     return 0 if counters["rx_frames"] and counters["tx_frames"] else 1

@@ -28,6 +28,11 @@ _CAN_ERR_MASK: Final = 0x1FFFFFFF
 _SK_MEMINFO_DROPS: Final = 8  # linux/sock_diag.h
 _OVERFLOW: Final = "socket-overflow"  # bus -> device: the relay did not come to read in time
 
+NO_CAN: Final = "this kernel has no SocketCAN"
+GET_CAN: Final = (
+    "try `modprobe can_raw`, install a kernel that has it (Debian: linux-image-amd64, not -cloud-amd64)"
+)
+
 _IFREQ: Final = struct.Struct("=16sH22x")  # name, then flags or the family of the hardware address
 _NAME_MAX: Final = 15
 _BUFFER_BYTES: Final = 4 << 20  # the kernel doubles it and charges 768 a frame: 10,900 frames
@@ -107,11 +112,9 @@ def _raw_socket() -> socket.socket:
     except OSError as error:
         if error.errno not in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT}:
             raise BusError(f"no CAN socket: {error.strerror}") from error
-        raise BusError(
-            "this kernel has no SocketCAN: try `modprobe can_raw`, install a kernel that has it (Debian: "
-            "linux-image-amd64, not -cloud-amd64), allow AF_CAN in RestrictAddressFamilies= of the service, "
-            "or use another python-can interface (`interface: udp_multicast`)"
-        ) from error
+        service = "allow AF_CAN in RestrictAddressFamilies=, " if "NOTIFY_SOCKET" in os.environ else ""
+        other = "or use another python-can interface (`interface: udp_multicast`)"
+        raise BusError(f"{NO_CAN}: {GET_CAN}, {service}{other}") from error
 
 
 def _prepare_interface(sock: socket.socket, channel: str, create: bool) -> int:
@@ -196,8 +199,8 @@ def _create_vcan(channel: str) -> None:
     cause = OSError(code, os.strerror(code))
     if code in {errno.EPERM, errno.EACCES}:
         raise BusError(
-            f"{channel}: to make it takes CAP_NET_ADMIN: as root, `ip link add dev {channel} type vcan` and "
-            f"`ip link set {channel} up`, or AmbientCapabilities=CAP_NET_ADMIN in the service"
+            f"{channel}: creating it needs root or CAP_NET_ADMIN: as root, `ip link add dev {channel} type "
+            f"vcan` and `ip link set {channel} up`, or AmbientCapabilities=CAP_NET_ADMIN in the service"
         ) from cause
     if code == errno.EOPNOTSUPP:
         raise BusError(

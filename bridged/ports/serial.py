@@ -276,7 +276,8 @@ def _explain_permission(path: Path) -> str:
     if status.st_mode & 0o060 == 0o060 and uid != 0 and status.st_gid not in {os.getegid(), *os.getgroups()}:
         return f"user {user} has no permission: add it to group {group} (`usermod -aG {group} {user}`)"
     owner = f"{stat.filemode(status.st_mode)}, group {group}"
-    return f"user {user} has no permission ({owner}): check udev rules, and DeviceAllow= of the service"
+    service = ", and DeviceAllow= of the service" if "NOTIFY_SOCKET" in os.environ else ", or be root"
+    return f"user {user} has no permission ({owner}): check the udev rule that gives it to a group{service}"
 
 
 def _explain_network(url: str, cause: BaseException) -> str:

@@ -18,8 +18,8 @@ from bridged.errors import BridgeError, PortError
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.ends import open_can
-from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, parse_fault
-from bridged.simulators.serve import Simulator
+from bridged.simulators.faults import CAN232_FAULTS, MEANINGS, USB2CAN_FAULTS, parse_fault
+from bridged.simulators.serve import Simulator, cyclic_frames
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
@@ -43,14 +43,18 @@ def load_eeprom(path: Path | None) -> Eeprom:
 
 def positive(text: str) -> float:
     """A finite number above 0, for argparse."""
-    value = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
-    return value
+    with contextlib.suppress(ValueError):
+        value = float(text)
+        if 0 < value < math.inf:
+            return value
+    raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
 
 
 def _whole(text: str) -> int:
-    return int(positive(str(int(text))))
+    with contextlib.suppress(ValueError):
+        if (value := int(text)) > 0:
+            return value
+    raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
 
 
 def _matching(pattern: str, meaning: str) -> Callable[[str], str]:
@@ -85,7 +89,7 @@ def _add_common(parser: argparse.ArgumentParser, faults: Sequence[str]) -> None:
     host.add_argument(
         "--line",
         metavar="PATH|unix:PATH",
-        help="the host is on this character device or listens on this socket, instead of a new terminal",
+        help="the host is on this existing device, or listens on this socket, instead of on a new terminal",
     )
     add("--bus", metavar="IFACE", help="SocketCAN interface on its CAN side, as vcan1")
     add(
@@ -93,8 +97,9 @@ def _add_common(parser: argparse.ArgumentParser, faults: Sequence[str]) -> None:
         type=positive,
         default=0.0,
         metavar="FPS",
-        help="mixed frames a second from a made-up bus",
+        help="frames a second from a made-up bus: ten identifiers, each with its period and a counter",
     )
+    add("--mixed", action="store_true", help="instead of ten identifiers random frames of all kinds")
     add(
         "--count",
         type=_whole,
@@ -116,7 +121,8 @@ def _add_common(parser: argparse.ArgumentParser, faults: Sequence[str]) -> None:
     )
     add("--state", type=Path, metavar="FILE", help="counters as JSON, written at the end and on SIGUSR1")
     fault = functools.partial(parse_fault, kinds=faults)
-    text = f"KIND@START[+DURATION] in seconds, KIND {', '.join(faults)}; may be repeated"
+    kinds = "; ".join(f"{kind}: {MEANINGS[kind]}" for kind in faults)
+    text = f"KIND@START[+DURATION] in seconds, may be repeated. {kinds}"
     add("--fault", type=fault, action="append", default=[], metavar="SPEC", help=text)
     add("--seed", type=int, default=0, metavar="N", help="of traffic and garbage")
 
@@ -134,7 +140,7 @@ def _add_can232(parser: argparse.ArgumentParser) -> None:
     serial = _matching(r"[0-9A-Z]{4}", "a serial number like A123")
     add("--serial-number", type=serial, default="A123", metavar="N", help="answer to N, without the N")
     add("--eeprom", type=Path, metavar="FILE", help="keeps the EEPROM and its write count, as JSON")
-    add("--precise", action="store_true", help="spin while the line is in use: exact, takes a processor")
+    add("--precise", action="store_true", help="busy-wait for exact timing (uses a whole core)")
 
 
 def _add_usb2can(parser: argparse.ArgumentParser) -> None:
@@ -205,6 +211,7 @@ def run(args: argparse.Namespace) -> int:
             bus=bus,
             record=record,
             traffic_fps=args.traffic,
+            traffic=None if args.mixed else cyclic_frames(random.Random(args.seed)),
             traffic_count=args.count,
             faults=args.fault,
             rng=random.Random(args.seed),

@@ -18,6 +18,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bridged.buses.socketcan import GET_CAN, NO_CAN
 from bridged.errors import BusError, PortError
 from bridged.simulators.sja1000 import Frame
 
@@ -65,11 +66,14 @@ def open_can(interface: str) -> socket.socket:
     try:
         bus = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
-        raise BusError(f"this kernel has no CAN: {error.strerror}") from error
+        raise BusError(f"{NO_CAN}: {GET_CAN}") from error
     try:
         bus.bind((interface,))
     except OSError as error:
         bus.close()
+        if error.errno == errno.ENODEV:
+            make = f"`ip link add dev {interface} type vcan; ip link set {interface} up` makes one"
+            raise BusError(f"{interface}: there is no such interface: {make}") from error
         raise BusError(f"{interface}: cannot be opened as a CAN interface: {error.strerror}") from error
     try:
         bus.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)

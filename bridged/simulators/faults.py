@@ -22,6 +22,24 @@ FAULTS = (*HOST_FAULTS, *BUS_FAULTS)
 CAN232_FAULTS = (*FAULTS, "refuseall")
 USB2CAN_FAULTS = (*FAULTS, "lostgo", "value2", "overrun")
 
+MEANINGS = {
+    "silence": "the adapter answers nothing",
+    "garbage": "noise on the line",
+    "refuse": "it refuses a frame, with a duration all",
+    "drop": "an answer is lost, with a duration all",
+    "reset": "it restarts and has forgotten its settings",
+    "listenonly": "it is put into listen-only by itself",
+    "poweroff": "no power, its line stays",
+    "unplug": "its terminal goes, and with a duration comes back",
+    "warning": "its CAN bus is error-warning",
+    "passive": "its CAN bus is error-passive",
+    "busoff": "its CAN bus is bus-off",
+    "refuseall": "it refuses each command",
+    "lostgo": "it does not say 'go on' after 'stop'",
+    "value2": "20 messages about its transmit buffer, of a value that its document does not know",
+    "overrun": "it has lost received frames",
+}
+
 BURST_S = 0.01  # between two bursts of a fault that lasts
 NOISE_MAX = 16  # bytes in one of them
 VALUE_2_BURST = 20  # messages

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from bridged.simulators.device import Device
     from bridged.simulators.uart import Uart
 
-__all__ = ["Fault", "Simulator", "mixed_frames", "record_line"]
+__all__ = ["Fault", "Simulator", "cyclic_frames", "mixed_frames", "record_line"]
 
 UART_QUEUE = 4096  # characters a host's UART takes for a paced line before its write waits
 SPIN_S = 0.001  # --precise: no sleeping so close to a deadline,
@@ -49,6 +49,38 @@ def mixed_frames(rng: random.Random) -> Iterator[Frame]:
         dlc = rng.randrange(9)
         data = b"" if remote else rng.randbytes(dlc)
         yield Frame(rng.getrandbits(29 if extended else 11), extended, remote, dlc, data)
+
+
+# Of a bus as in a vehicle: identifier, DLC, period in units of its own.
+CYCLIC = (
+    (0x100, 8, 4),
+    (0x110, 8, 4),
+    (0x1A0, 6, 8),
+    (0x200, 8, 8),
+    (0x2F0, 4, 16),
+    (0x310, 2, 16),
+    (0x4B0, 8, 32),
+    (0x5E0, 1, 32),
+    (0x18FEF100, 8, 32),
+    (0x18FF0A17, 3, 64),
+)
+
+
+def cyclic_frames(rng: random.Random) -> Iterator[Frame]:
+    """Ten identifiers, each again and again in its own period, without end.
+
+    The first bytes count the frames of the identifier, low byte first; the others stay as they are.
+    """
+    # When the next one is due, place in CYCLIC (no two are due at once), and how many there were.
+    due = [(rng.random() * period, place, 0) for place, (_, _, period) in enumerate(CYCLIC)]
+    heapq.heapify(due)
+    constant = rng.randbytes(8)
+    while True:
+        at, place, count = due[0]
+        can_id, dlc, period = CYCLIC[place]
+        counter = (count % (1 << 8 * min(dlc, 2))).to_bytes(min(dlc, 2), "little")
+        yield Frame(can_id, can_id > 0x7FF, False, dlc, counter + constant[: dlc - len(counter)])
+        heapq.heapreplace(due, (at + period, place, count + 1))
 
 
 def record_line(frame: Frame) -> str:
@@ -73,8 +105,9 @@ class Simulator:
     it is there from the start; the link and the files while `run()` runs.
     `bus` is any datagram socket that carries `struct can_frame`, left open at the end. What the device puts
     on the bus goes to `on_frame` and, a line each, to `record`, an unbuffered file.
-    `traffic_fps` frames a second come from a bus that does not exist, or `traffic_count` frames in all: then
-    those that the device does not see, because its channel is not open, come again.
+    `traffic_fps` frames a second, mixed_frames() or those of `traffic`, come from a bus that does not exist,
+    or `traffic_count` frames in all: then those that the device does not see, because its channel is not
+    open, come again.
     `precise` spins instead of sleeping while the line is in use. PortError if an end cannot be made.
     """
 
@@ -88,6 +121,7 @@ class Simulator:
         on_frame: Callable[[Frame], None] | None = None,
         record: BinaryIO | None = None,
         traffic_fps: float = 0.0,
+        traffic: Iterator[Frame] | None = None,
         traffic_count: int | None = None,
         faults: Sequence[Fault] = (),
         rng: random.Random | None = None,
@@ -123,7 +157,7 @@ class Simulator:
         rng = rng or random.Random(0)
         self._noise = random.Random()
         self._noise.setstate(rng.getstate())  # of its own: noise does not change the traffic
-        self._traffic = mixed_frames(rng)
+        self._traffic = mixed_frames(rng) if traffic is None else traffic
         self._traffic_frame = next(self._traffic)
         self._traffic_s = 1 / traffic_fps if traffic_fps else math.inf
         self._traffic_count = traffic_count

@@ -36,7 +36,7 @@ class Adapter:
         # Not --precise: it would spin, and take from the virtual machine the processor that it needs.
         arguments = [
             "simulate", "can232", "--line", "unix:../ftdi0.sock", "--uart-rate", BAUD,
-            "--traffic", TRAFFIC, "--state", self._state.name,
+            "--traffic", TRAFFIC, "--mixed", "--state", self._state.name,
         ]  # fmt: skip
         self._process = HostProcess([str(argument) for argument in arguments], f"loss-{name}")
         wait_for(lambda: self._process.out, "the simulated adapter")

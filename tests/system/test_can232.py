@@ -262,6 +262,6 @@ def test_demo_shows_frames_both_ways(rig: Rig) -> None:
     assert demo.wait(180) == 0, str(demo)
     assert "from the adapter" in demo.out
     assert "to the adapter" in demo.out
-    assert "Adapter closed: closed" in demo.out
+    assert "Its channel is closed." in demo.out
     if not existed:
         subprocess.run(["ip", "link", "delete", "vcan0"], check=True)

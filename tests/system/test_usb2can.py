@@ -42,7 +42,7 @@ def configuration(port: str, bus: str, **transmit: Any) -> dict[str, Any]:
 
 
 def traffic(count: int, seed: int = SEED) -> list[str]:
-    """What a simulated bus carries with --traffic, --count and --seed."""
+    """What a simulated bus carries with --mixed, --traffic, --count and --seed."""
     frames = serve.mixed_frames(random.Random(seed))
     return [serve.record_line(next(frames)).strip() for _ in range(count)]
 
@@ -154,7 +154,7 @@ def test_each_way_at_1_mbit(rig: Rig, raw: bool) -> None:
     chip, near = rig.chip("ftdi0"), rig.vcan()
     port = address(chip.serial_number, raw=raw)
     dump = rig.candump(near)
-    adapter = Adapter.on_host(rig, "--traffic", FULL_BUS, "--count", FRAMES, "--seed", SEED)
+    adapter = Adapter.on_host(rig, "--mixed", "--traffic", FULL_BUS, "--count", FRAMES, "--seed", SEED)
     bridge = rig.bridge(configuration(port, near))
     bridge.wait_state("running")
     seen = adapter.wait_traffic()
@@ -182,7 +182,7 @@ def test_both_ways_at_once(rig: Rig, raw: bool) -> None:
     back = traffic(count)
     there = [frame for frame in mixed_frames(count + 100, seed=2) if frame not in set(back)][:count]
     dump = rig.candump(near)
-    adapter = Adapter.on_host(rig, "--traffic", 2000, "--count", count, "--seed", SEED)
+    adapter = Adapter.on_host(rig, "--mixed", "--traffic", 2000, "--count", count, "--seed", SEED)
     bridge = rig.bridge(configuration(port, near))
     bridge.wait_ready(lambda: dump.count, "the first frame")
     assert rig.play(near, there).wait(300) == 0

@@ -261,7 +261,10 @@ class TestTtyErrors:
     @pytest.mark.parametrize(
         ("mode", "text"),
         [
-            (0o620, r"user nobody has no permission \(crw--w----, group tty\): check udev rules"),
+            (
+                0o620,
+                r"user nobody has no permission \(crw--w----, group tty\): check the udev rule that",
+            ),
             (0o660, r"user nobody has no permission: add it to group tty \(`usermod -aG tty nobody`\)"),
         ],
     )

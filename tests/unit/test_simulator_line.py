@@ -1,5 +1,7 @@
 """The simulator in real time: as a USB2CAN, with counted frames, with a record, on a line that is there."""
 
+import errno
+import itertools
 import json
 import os
 import random
@@ -14,10 +16,11 @@ import pytest
 from simulating import TIMEOUT_S, ask, by_hand, count_calls, host, process, read, running, until
 
 from bridged import cli
-from bridged.errors import PortError
+from bridged.errors import BusError, PortError
 from bridged.simulators.can232 import Can232, Eeprom
-from bridged.simulators.ends import LineEnd
-from bridged.simulators.serve import Simulator, mixed_frames, record_line
+from bridged.simulators.ends import LineEnd, open_can
+from bridged.simulators.faults import CAN232_FAULTS, MEANINGS, USB2CAN_FAULTS
+from bridged.simulators.serve import CYCLIC, Simulator, cyclic_frames, mixed_frames, record_line
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.usb2can import State, Usb2can
 
@@ -49,6 +52,7 @@ def test_the_command_simulates_a_usb2can(tmp_path: Path):
     options = (
         "--record",
         str(record),
+        "--mixed",
         "--traffic",
         "5000",
         "--count",
@@ -157,6 +161,70 @@ def test_options_that_make_no_sense(tmp_path: Path, capsys: pytest.CaptureFixtur
     for options in (["can232", "--fault", "lostgo@1"], ["usb2can", "--link", "a", "--line", "b"]):
         with pytest.raises(SystemExit):
             cli.main(["simulate", *options])
+
+
+def test_arguments_that_are_no_numbers(capsys: pytest.CaptureFixture[str]):
+    for arguments, text in (
+        (["demo", "--duration", "abc"], "argument --duration: expected a number above 0, got 'abc'"),
+        (["demo", "--rate", "-1"], "argument --rate: expected a number above 0, got '-1'"),
+        (["simulate", "can232", "--count", "1.5"], "--count: expected a whole number above 0, got '1.5'"),
+        (["simulate", "can232", "--count", "0"], "--count: expected a whole number above 0, got '0'"),
+    ):
+        with pytest.raises(SystemExit):
+            cli.main(arguments)
+        assert text in capsys.readouterr().err
+
+
+def test_every_fault_is_explained(capsys: pytest.CaptureFixture[str]):
+    for adapter, kinds in (("can232", CAN232_FAULTS), ("usb2can", USB2CAN_FAULTS)):
+        with pytest.raises(SystemExit):
+            cli.main(["simulate", adapter, "--help"])
+        shown = "".join(capsys.readouterr().out.split())
+        for kind in kinds:
+            assert f"{kind}: {MEANINGS[kind]}".replace(" ", "") in shown
+
+
+@pytest.mark.parametrize(
+    ("at", "code", "text"),
+    [
+        ("__init__", errno.EAFNOSUPPORT, r"has no SocketCAN: try `modprobe can_raw`"),
+        (
+            "bind",
+            errno.ENODEV,
+            "vcan7: there is no such interface: `ip link add dev vcan7 type vcan; ip link set",
+        ),
+        ("bind", errno.EPERM, "vcan7: cannot be opened as a CAN interface: Operation not permitted"),
+    ],
+)
+def test_a_bus_that_cannot_be_had(monkeypatch: pytest.MonkeyPatch, at: str, code: int, text: str):
+    class Refusing:
+        def __init__(self, *_: object) -> None:
+            self.bind = self.close = lambda *_: None
+            if at == "__init__":
+                raise OSError(code, os.strerror(code))
+            self.bind = self.refuse
+
+        def refuse(self, _: object) -> None:
+            raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(socket, "socket", Refusing)
+    with pytest.raises(BusError, match=text):
+        open_can("vcan7")
+
+
+def test_cyclic_traffic():
+    """Ten identifiers whose first bytes count, each at its own rate; the same with the same seed."""
+    frames = list(itertools.islice(cyclic_frames(random.Random(3)), 6400))
+    assert frames == list(itertools.islice(cyclic_frames(random.Random(3)), 6400))
+    per_unit = sum(1 / period for _, _, period in CYCLIC)
+    for can_id, dlc, period in CYCLIC:
+        own = [frame for frame in frames if frame.can_id == can_id]
+        assert abs(len(own) - 6400 / period / per_unit) <= 1
+        assert {(len(frame.data), frame.dlc, frame.remote) for frame in own} == {(dlc, dlc, False)}
+        assert [frame.data[:2] for frame in own] == [
+            (count % 256 ** min(dlc, 2)).to_bytes(min(dlc, 2), "little") for count in range(len(own))
+        ]
+        assert len({frame.data[2:] for frame in own}) == 1
 
 
 def test_what_is_recorded_is_what_cansend_takes():
