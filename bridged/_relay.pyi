@@ -63,6 +63,13 @@ class Relay:
     def attach_port(self, fd: int | _HasFileno, /) -> None:
         """Talk to this non-blocking stream. Gates are closed: only commands go, frames are dropped."""
     def detach_port(self) -> None: ...
+    def cut(self) -> tuple[bool, bytes, int]:
+        """After detach_port(): whether the device may not have read all frames; the message of which the port
+        took a part (empty: none), and how many bytes of it."""
+    def resume(self, message: bytes, taken: int, /) -> None:
+        """After attach_port() of the same port: first the rest of the message of cut()."""
+    def last_words(self, words: bytes, /) -> None:
+        """Say this at once, behind the message that the port took in part; nothing else is sent any more."""
     def attach_bus(self, fd: int | _HasFileno, /) -> None: ...
     def detach_bus(self) -> None: ...
     def hold_bus(self, held: bool, /) -> None:

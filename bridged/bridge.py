@@ -6,7 +6,6 @@ does the opening of a port, which may take seconds.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import logging
 import os
@@ -26,6 +25,7 @@ from bridged.buses import open_bus
 from bridged.errors import PortError
 from bridged.exchanges import REPLIES, Exchanges
 from bridged.health import BusState
+from bridged.kept_port import KeptPort
 from bridged.lifecycle import Action, Backoff, Event, State, Told, chance, repeated, transition
 from bridged.polling import NOISE, NOISE_CAUSES, HealthPolling
 from bridged.ports import open_port
@@ -121,6 +121,7 @@ class Bridge:
             sync=sync.request,
             sync_prefix=sync.prefix,
         )
+        self._kept = KeptPort(self._relay)
         self._bus_end = BusEnd(config, self._relay, self._open_bus)
         self._exchanges = Exchanges(self._relay, self._dispatch)
         self._polling = HealthPolling(
@@ -147,6 +148,7 @@ class Bridge:
         bus = None
         if predecessor is not None:
             bus = predecessor._hand_over_bus(self.config)
+            self._take_over_port(predecessor)
             predecessor.close()
             self._counted_before = predecessor.snapshot()["counters"]
             self._started = predecessor._started
@@ -359,7 +361,12 @@ class Bridge:
                 self._timer = None
                 self._watch.disarm()
                 self._opening = True
-                threading.Thread(target=self._open_port, name="open", daemon=True).start()
+                port = self._kept.take()
+                if port is None:
+                    threading.Thread(target=self._open_port, name="open", daemon=True).start()
+                else:
+                    self._opened.put(port)
+                    os.eventfd_write(self._opened_fd, 1)
             case Action.INITIALISE:
                 assert self._port is not None
                 self.channel_open = True
@@ -428,10 +435,12 @@ class Bridge:
         self._watch.opened(result.fd)
         self._sharing.opened(result.description, time.monotonic())
         self._relay.attach_port(result.fd)
+        self._kept.resume()
         self._dispatch(Event.OPENED)
 
     def _run(self) -> None:
         self._backoff.runs(time.monotonic())
+        self._kept.runs()
         if self.adapter.polling is not None:
             polling = self.adapter.polling
             self._relay.set_polling(polling.request, polling.prefix, polling.interval_s)
@@ -470,7 +479,7 @@ class Bridge:
                 self._on_event(kind, token, text)
         self._sharing.closed()
         if self._port is not None:
-            self._port.close()
+            self._kept.release(self._port)
             self._port = None
 
     def _finish(self) -> None:
@@ -494,11 +503,10 @@ class Bridge:
 
     def _last_words(self) -> None:
         """Closes the channel without awaiting answers."""
-        self._relay.detach_port()
         if self._port is not None:
-            with contextlib.suppress(OSError):
-                os.write(self._port.fd, self.adapter.last_words)
-                time.sleep(LAST_WORDS_S)  # close() throws away what is not out yet
+            self._relay.last_words(self.adapter.last_words)
+            time.sleep(LAST_WORDS_S)  # close() throws away what is not out yet
+        self._relay.detach_port()
 
     @property
     def settled(self) -> bool:
@@ -513,8 +521,15 @@ class Bridge:
             return None
         return self._bus_end.hand_over()
 
+    def _take_over_port(self, old: Bridge) -> None:
+        """What a bridge that ended has kept of the port, if this one has the same adapter."""
+        before, adapter = old.config.adapter, self.config.adapter
+        if (before.type, before.port) == (adapter.type, adapter.port):
+            self._kept.adopt(old._kept)
+
     def close(self) -> None:
         """After `finished`, or instead of start(): gives back what it holds."""
+        self._kept.close()
         self._bus_end.close()
         self._watch.close()
         if not self._opening and self._opened_fd >= 0:

@@ -56,6 +56,8 @@ struct codec_state {
  *
  * level: how many frames wait in the device's transmit buffer, if a CODEC_TEXT tells it, else -1. NULL:
  * the device answers each frame, by CODEC_OK, CODEC_SENT or CODEC_REFUSED.
+ *
+ * length: of the message to the device that begins at message[0], of n bytes where it and others are.
  */
 struct codec {
     const char *name;
@@ -65,6 +67,7 @@ struct codec {
                      struct codec_message *msg);
     size_t (*encode)(const struct can_frame *frame, uint8_t *out);
     int (*level)(const uint8_t *text, size_t length);
+    size_t (*length)(const uint8_t *message, size_t n);
 };
 
 extern const struct codec codec_can232;

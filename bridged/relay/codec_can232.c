@@ -255,10 +255,18 @@ static size_t can232_encode(const struct can_frame *frame, uint8_t *out)
     return n;
 }
 
+/* A command without CR (there are those that only spoil what was typed before) ends with all that there is. */
+static size_t can232_length(const uint8_t *message, size_t n)
+{
+    const uint8_t *end = memchr(message, CR, n);
+    return end ? (size_t)(end - message) + 1 : n;
+}
+
 const struct codec codec_can232 = {
     .name = "can232",
     .line_max = CAN232_LINE_MAX,
     .frame_max = CAN232_FRAME_MAX,
     .decode = can232_decode,
     .encode = can232_encode,
+    .length = can232_length,
 };

@@ -376,6 +376,11 @@ static size_t usb2can_encode(const struct can_frame *frame, uint8_t *out)
     return n;
 }
 
+static size_t usb2can_length(const uint8_t *message, size_t n)
+{
+    return n < HEAD ? n : min_size((size_t)HEAD + message[2], n);
+}
+
 /* The answer to COMMAND GET: [128,] critical limit, ready limit, frames in the first and second buffer. */
 static int usb2can_level(const uint8_t *text, size_t length)
 {
@@ -395,4 +400,5 @@ const struct codec codec_usb2can = {
     .decode = usb2can_decode,
     .encode = usb2can_encode,
     .level = usb2can_level,
+    .length = usb2can_length,
 };

@@ -96,6 +96,7 @@ void flow_sent(struct relay *r, const struct tx_frame *tx)
         f->noise = r->count.skipped_bytes;
     *sent_at(f, f->sent_count++) = *tx;
     f->room--;
+    r->unread = true;
 }
 
 /* When the question that tells whether anything can go is due again. */
@@ -148,6 +149,7 @@ void flow_answered(struct relay *r, const struct codec_message *msg, int64_t now
     if (grows)
         f->limit = 2 * f->limit < r->set.window ? 2 * f->limit : r->set.window;
     f->settling = f->settling && f->sent_count;
+    r->unread = f->sent_count > 0;
 
     /* A "go" may be lost: the level says the same. Where none is told, one frame goes after some time, to see. */
     int level = r->set.codec->level(msg->text, msg->length);

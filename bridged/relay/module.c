@@ -210,6 +210,50 @@ static PyObject *Relay_detach_port(PyObject *self, PyObject *Py_UNUSED(ignored))
     return relay_unlock_wake(r);
 }
 
+static PyObject *Relay_cut(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    const struct cut cut = transmit_cut(r);
+    bool unread = r->unread;
+    relay_unlock(r);
+    return Py_BuildValue("(Ny#n)", PyBool_FromLong(unread), (const char *)cut.message, (Py_ssize_t)cut.length,
+                         (Py_ssize_t)cut.taken);
+}
+
+static PyObject *Relay_resume(PyObject *self, PyObject *args)
+{
+    struct cut cut = {0};
+    Py_buffer message;
+    Py_ssize_t taken;
+    if (!PyArg_ParseTuple(args, "y*n:resume", &message, &taken))
+        return NULL;
+    bool valid = message.len <= COMMAND_SIZE && taken > 0 && taken < message.len;
+    if (valid) {
+        cut.length = (size_t)message.len;
+        cut.taken = (size_t)taken;
+        memcpy(cut.message, message.buf, cut.length);
+    }
+    PyBuffer_Release(&message);
+    if (!valid) {
+        PyErr_SetString(PyExc_ValueError, "resume takes what cut() gave, of which a part was taken");
+        return NULL;
+    }
+    struct relay *r = relay_lock(self);
+    transmit_resume(r, &cut);
+    return relay_unlock_wake(r);
+}
+
+static PyObject *Relay_last_words(PyObject *self, PyObject *arg)
+{
+    Py_buffer words;
+    if (PyObject_GetBuffer(arg, &words, PyBUF_SIMPLE) < 0)
+        return NULL;
+    struct relay *r = relay_lock(self);
+    transmit_last_words(r, words.buf, (size_t)words.len);
+    PyBuffer_Release(&words);
+    return relay_unlock_wake(r);
+}
+
 static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
 {
     int fd = PyObject_AsFileDescriptor(arg);
@@ -411,6 +455,9 @@ static PyMethodDef RELAY_METHODS[] = {
     {"fileno", Relay_fileno, METH_NOARGS, NULL},
     {"attach_port", Relay_attach_port, METH_O, NULL},
     {"detach_port", Relay_detach_port, METH_NOARGS, NULL},
+    {"cut", Relay_cut, METH_NOARGS, NULL},
+    {"resume", Relay_resume, METH_VARARGS, NULL},
+    {"last_words", Relay_last_words, METH_O, NULL},
     {"attach_bus", Relay_attach_bus, METH_O, NULL},
     {"detach_bus", Relay_detach_bus, METH_NOARGS, NULL},
     {"hold_bus", Relay_hold_bus, METH_O, NULL},

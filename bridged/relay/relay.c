@@ -390,6 +390,7 @@ static int64_t bus_read(struct relay *r, struct moment turn, bool live)
 void relay_attach_port(struct relay *r, int fd)
 {
     relay_detach_port(r);
+    transmit_forget(r);
     r->port = fd;
     r->port_full = false;
     int error = watch(r, EPOLL_CTL_ADD, fd, PORT, EPOLLIN);

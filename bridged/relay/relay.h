@@ -119,6 +119,12 @@ struct flow {
     int64_t ask_at_ns, ask_delay_ns; /* while nothing can go */
 };
 
+/* The message of which the port took only so many bytes before it was detached; length 0: none. */
+struct cut {
+    size_t taken, length;
+    uint8_t message[COMMAND_SIZE];
+};
+
 struct relay {
     pthread_mutex_t lock; /* guards all below */
     struct settings set;
@@ -157,6 +163,7 @@ struct relay {
     uint8_t out[OUT_BUFFER];
     size_t out_start, out_end;
     int64_t out_until_ns; /* what is in `out` is too old then */
+    bool unread;          /* the device may not have read all frames: its answer to what came after them is missing */
 
     /* device -> bus (relay.c) */
     struct codec_state decoder;
@@ -220,6 +227,10 @@ struct tx_frame retry_pop(struct relay *r);
 
 /* transmit.c: all with the lock held */
 void transmit_reset(struct relay *r);
+struct cut transmit_cut(const struct relay *r);
+void transmit_resume(struct relay *r, const struct cut *cut);
+void transmit_forget(struct relay *r);
+void transmit_last_words(struct relay *r, const uint8_t *words, size_t length);
 bool transmit_command(struct relay *r, const struct command *command);
 bool transmit_idle(const struct relay *r);
 void transmit_pump(struct relay *r, int64_t now);

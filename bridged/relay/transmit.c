@@ -60,6 +60,45 @@ static void retry_doubt(struct relay *r)
         queue_drop(r, TX_UNANSWERED);
 }
 
+/* Of `out` nothing stays but the message of which the port took a part. (None is longer than COMMAND_SIZE, but for
+ * commands without an end.) */
+static void out_cut(struct relay *r)
+{
+    size_t at = 0, next = 0;
+    while (next < r->out_start) {
+        at = next;
+        next += r->set.codec->length(r->out + at, r->out_end - at);
+    }
+    if (next == r->out_start || next - at > COMMAND_SIZE)
+        at = next = r->out_start;
+    memmove(r->out, r->out + at, next - at);
+    r->out_start -= at;
+    r->out_end = next - at;
+    r->out_until_ns = NEVER;
+}
+
+struct cut transmit_cut(const struct relay *r)
+{
+    struct cut cut = {.taken = r->out_start, .length = r->out_end};
+    memcpy(cut.message, r->out, cut.length);
+    return cut;
+}
+
+/* The port is that of the cut: the rest goes before all else. */
+void transmit_resume(struct relay *r, const struct cut *cut)
+{
+    memcpy(r->out, cut->message, cut->length);
+    r->out_start = cut->taken;
+    r->out_end = cut->length;
+}
+
+/* The port is new, or that of a device whose cut is not to be finished. */
+void transmit_forget(struct relay *r)
+{
+    r->out_start = r->out_end = 0;
+    r->unread = false;
+}
+
 /* The port is gone or new: what was in flight will never be answered. */
 void transmit_reset(struct relay *r)
 {
@@ -70,9 +109,8 @@ void transmit_reset(struct relay *r)
         relay_emit(r, EVENT_TIMEOUT, r->commands[r->command_head].token, NULL, 0);
         r->command_head = (r->command_head + 1) % COMMANDS_MAX;
     }
-    r->out_start = r->out_end = 0;
+    out_cut(r);
     r->resyncing = r->silent = r->polling = r->polled = r->checking = r->doubtful = false;
-    r->out_until_ns = NEVER;
     r->poll.length = 0;
     r->retry_delay_ns = RETRY_FIRST_NS;
     r->retry_at_ns = 0;
@@ -413,6 +451,17 @@ static void out_flush(struct relay *r)
     r->out_until_ns = NEVER;
 }
 
+/* Says this at once, but behind the message that the port took in part. Nothing that waited is sent any more. */
+void transmit_last_words(struct relay *r, const uint8_t *words, size_t length)
+{
+    transmit_reset(r);
+    if (r->port < 0 || length > OUT_BUFFER - r->out_end)
+        return;
+    memcpy(r->out + r->out_end, words, length);
+    r->out_end += length;
+    out_flush(r);
+}
+
 /* Nothing waits, nothing is in flight, nothing is in the device's buffer: transmit_pump and transmit_deadline
  * have nothing to look at. */
 bool transmit_idle(const struct relay *r)
@@ -436,11 +485,16 @@ void transmit_pump(struct relay *r, int64_t now)
     check_answers(r, now);
     if (r->port < 0)
         return;
-    if (r->out_start == 0) { /* a message the port took in part is finished first */
-        queue_expire(r, now);
-        while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now))
-            ;
+    if (r->out_start) { /* a message the port took in part is finished first */
+        if (r->out_until_ns == NEVER) /* begun before this port was attached */
+            r->out_until_ns = now + r->set.answer_timeout_ns;
+        out_flush(r);
     }
+    if (r->out_start || r->port < 0)
+        return;
+    queue_expire(r, now);
+    while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now))
+        ;
     out_flush(r);
 }
 

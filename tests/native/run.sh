@@ -59,6 +59,9 @@ for cc in gcc clang; do
     options="-D_GNU_SOURCE -pthread -Wl,--wrap=send,--wrap=sendmmsg"
     # shellcheck disable=SC2086 # names without spaces
     run_test relay_interface $parts
+    options="-D_GNU_SOURCE -pthread -Wl,--wrap=write"
+    # shellcheck disable=SC2086
+    run_test relay_cut $parts
     options=
 done
 if [ "$compilers" = 0 ]; then

@@ -15,6 +15,7 @@ from bridged.adapters.base import Answer, Reply, Steps
 from bridged.adapters.usb2can import Usb2can as Adapter
 from bridged.can import BitTiming
 from bridged.config import ChannelConfig, Usb2canConfig
+from bridged.errors import AdapterError
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.usb2can import Usb2can
 
@@ -58,11 +59,13 @@ class Rig:
             sync=self.adapter.sync.request,
             sync_prefix=self.adapter.sync.prefix,
         )
-        self.port, self._near_port = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._unplugged: list[socket.socket] = []
+        self.port, self.near_port = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self.bus, self._near_bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        for s in (self.port, self._near_port, self.bus, self._near_bus):
+        for s in (self.port, self.near_port, self.bus, self._near_bus):
             s.setblocking(False)
-        self._down: deque[tuple[int, bytes]] = deque()  # to the device: when it arrives
+        self.down: deque[tuple[int, bytes]] = deque()  # to the device: when it arrives
+        self.reads: int | None = None  # how many bytes the device reads before it stalls; None: all
         self._up: deque[tuple[int, bytes]] = deque()
         self._relay_next: int | None = None
         self.damage = (b"", 0)  # the message that begins so loses this byte
@@ -72,7 +75,7 @@ class Rig:
         self.received: list[bytes] = []  # from the relay, on the host's bus
         self.events: list[tuple[int, int, bytes]] = []
         self.relay.attach_bus(self._near_bus)
-        self.relay.attach_port(self._near_port)
+        self.relay.attach_port(self.near_port)
         self.perform(self.adapter.init_steps(None))
         self.open()
 
@@ -107,7 +110,8 @@ class Rig:
                 for kind, token, text in self.take_events():
                     if token == 1 and kind in {_relay.EVENT_TEXT, _relay.EVENT_TIMEOUT}:
                         answer = Answer(Reply.TEXT if kind == _relay.EVENT_TEXT else Reply.NONE, text)
-            assert answer.reply in exchange.accept
+            if answer.reply not in exchange.accept:
+                raise AdapterError(f"did not answer the request to {exchange.purpose}")
 
     def run(self, seconds: float) -> None:
         end = self.now + round(seconds * S)
@@ -118,7 +122,8 @@ class Rig:
     def _next(self) -> int:
         """When something happens that nobody has to be told of."""
         device = self.device.next_deadline()
-        times = [self._relay_next, *(pipe[0][0] for pipe in (self._up, self._down) if pipe)]
+        pipes = (self._up, self.down if self.reads != 0 else ())
+        times = [self._relay_next, *(pipe[0][0] for pipe in pipes if pipe)]
         times.append(math.ceil(device * S) if device < math.inf else None)
         return min((time for time in times if time is not None), default=1 << 62)
 
@@ -136,8 +141,14 @@ class Rig:
         while self._up and self._up[0][0] <= self.now:
             self.port.send(self._up.popleft()[1])
         self.turn()
-        while self._down and self._down[0][0] <= self.now:
-            self.device.host_writes(now_s, self._down.popleft()[1])
+        while self.down and self.down[0][0] <= self.now and self.reads != 0:
+            at, data = self.down.popleft()
+            read = data[: self.reads]
+            if self.reads is not None:
+                self.reads -= len(read)
+            if len(read) < len(data):
+                self.down.appendleft((at, data[len(read) :]))
+            self.device.host_writes(now_s, read)
         if output := self.device.take_output(now_s):
             head, at = self.damage
             if head and head in output:
@@ -156,7 +167,7 @@ class Rig:
 
     def _carry(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            self._down.append((self.now + LATENCY_NS, self.port.recv(1 << 16)))
+            self.down.append((self.now + LATENCY_NS, self.port.recv(1 << 16)))
 
     def take_events(self) -> list[tuple[int, int, bytes]]:
         events, self.events = self.events, []
@@ -166,6 +177,16 @@ class Rig:
         for frame in frames:
             self.bus.send(packed(frame))
             self.turn()
+
+    def unplug(self) -> None:
+        """The port comes to its end, and all that was under way is lost; there is a new one."""
+        self.port.close()
+        self._unplugged.append(self.near_port)
+        self.port, self.near_port = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        for s in (self.port, self.near_port):
+            s.setblocking(False)
+        self.down.clear()
+        self._up.clear()
 
     def turn(self) -> None:
         self._relay_next = self.relay.turn(self.now)
@@ -182,7 +203,7 @@ class Rig:
         return {**c, **tx, "tx_dropped": sum(tx.values())}  # type: ignore[dict-item]
 
     def close(self) -> None:
-        for s in (self.port, self._near_port, self.bus, self._near_bus):
+        for s in (self.port, self.near_port, self.bus, self._near_bus, *self._unplugged):
             s.close()
         assert not [
             text for text in self.device.violations if not (self._stop_lost and "after a STOP" in text)

@@ -392,6 +392,97 @@ def test_a_triple_is_a_fault(bench: Usb2canBench, monkeypatch: pytest.MonkeyPatc
     thread.join(LIMIT_S)
 
 
+# --- a device that stops reading --------------------------------------------------------------
+
+
+class StallingDevice:
+    """A simulated USB2CAN at the far end of a socketpair; it reads `reads` bytes more (None: all)."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.port = PairPort()
+        self.openings = 0
+        self.reads: int | None = None
+        self.device = Usb2can(time.monotonic(), stop_grace_s=STOP_GRACE_S)
+        self.frames: list[Frame] = []
+        self._thread = threading.Thread(target=self._live)
+        self._thread.start()
+        monkeypatch.setattr(bridge_module, "open_port", self._open)
+
+    def _open(self, *_args: object) -> PairPort:
+        self.openings += 1
+        return self.port
+
+    def _live(self) -> None:
+        far, device = self.port.far, self.device
+        while True:
+            if select.select([far] if self.reads != 0 else [], [], [], 0.001)[0]:
+                data = far.recv(4096 if self.reads is None else self.reads)
+                if not data:
+                    return
+                if self.reads is not None:
+                    self.reads -= len(data)
+                device.host_writes(time.monotonic(), data)
+            if output := device.take_output(time.monotonic()):
+                far.send(output)
+            self.frames += device.take_bus_frames()
+
+    def stop(self) -> None:
+        self.reads = None
+        self._thread.join(LIMIT_S)
+        assert not self._thread.is_alive()
+        self.port.far.close()
+
+
+@pytest.fixture
+def stalling(bench: Usb2canBench, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Bridge, StallingDevice]]:
+    """In the middle of one of three frames, when it is noticed."""
+    end = StallingDevice(monkeypatch)
+    bridge = started(bench.bridge())
+    end.reads = 20
+    bench.send(*numbered(3, length=8))
+    run_until(bridge, lambda: bridge.state is State.CLOSING)
+    assert end.reads == 0
+    yield bridge, end
+    if not bridge.finished:
+        stopped(bridge)
+    end.stop()
+
+
+def test_a_frame_is_whole_though_the_device_stopped_reading_in_it(
+    stalling: tuple[Bridge, StallingDevice], caplog: pytest.LogCaptureFixture
+) -> None:
+    bridge, end = stalling
+    run_until(bridge, lambda: bridge.state is State.BACKOFF)
+    end.reads = None
+    run_until(bridge, lambda: bridge.state is State.RUNNING)
+    assert (end.openings, counters(bridge)["reconnects"]) == (1, 1)
+    assert counters(bridge)["tx_dropped"]["unanswered"] > 0
+    assert "the adapter reads no more: its port stays open" in caplog.text
+    assert [frame for frame in end.frames if frame not in numbered(3, length=8)] == []
+    assert end.device.violations == []
+
+
+def test_a_device_that_reads_on_at_the_end_or_later_is_closed(
+    stalling: tuple[Bridge, StallingDevice], bench: Usb2canBench
+) -> None:
+    """Also by the next bridge in the same process, after a reload."""
+    bridge, end = stalling
+    successor = bench.bridge()
+    bridge.stop(successor.config)
+    run_until(bridge, lambda: bridge.settled)
+    end.reads = None
+    deadline = time.monotonic() + LIMIT_S
+    while not end.device.chip.in_reset:
+        assert time.monotonic() < deadline
+        time.sleep(0)
+    assert [frame for frame in end.frames if frame not in numbered(3, length=8)] == []
+    successor.start(bridge)
+    run_until(successor, lambda: successor.state is State.RUNNING)
+    assert end.openings == 1
+    stopped(successor)
+    assert end.device.violations == []
+
+
 # --- flow, events, counters -------------------------------------------------------------------
 
 

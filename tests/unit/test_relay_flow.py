@@ -84,7 +84,7 @@ def test_a_stop_that_never_ends_is_noticed_and_nothing_goes_late() -> None:
         rig.perform(rig.adapter.close_steps(drain=False))
         rig.device.set_bus_off(rig.now / S, False)
         rig.relay.detach_port()
-        rig.relay.attach_port(rig._near_port)
+        rig.relay.attach_port(rig.near_port)
         rig.perform(rig.adapter.init_steps(None))
         rig.open()
         rig.send(numbered(100))
@@ -300,7 +300,7 @@ def test_no_order_is_reversed_across_a_reconnect() -> None:
         rig.run(0.01)
         assert rig.counters()["tx_returned"] == 1
         rig.relay.detach_port()
-        rig.relay.attach_port(rig._near_port)
+        rig.relay.attach_port(rig.near_port)
         rig.open()
         c = rig.run_until_done(3.0)
         assert rig.sent == [numbered(0), second]
