@@ -370,7 +370,9 @@ class Bridge:
             case Action.INITIALISE:
                 assert self._port is not None
                 self.channel_open = True
-                self._exchanges.run(self.adapter.init_steps(self._port.serial_number), Event.READY)
+                self._exchanges.run(
+                    self.adapter.init_steps(self._port.serial_number, self._port.product), Event.READY
+                )
             case Action.RUN:
                 self._run()
             case Action.CLOSE:

@@ -134,6 +134,7 @@ class HealthPolling:
         """What the adapter said unasked."""
         log.debug("adapter said %r unasked", text)
         if self.next_at is None and self._answers is None:
+            self._adapter.saw_text(text)
             return
         try:
             seen = self._adapter.read_report(text)

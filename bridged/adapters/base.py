@@ -95,10 +95,10 @@ class Adapter(Protocol):
     def last_words(self) -> bytes:
         """Closes the channel, where no time is left to await answers."""
 
-    def init_steps(self, serial_number: str | None) -> Steps:
+    def init_steps(self, serial_number: str | None, product: str | None = None) -> Steps:
         """From whatever state to an open channel. Raises AdapterError for a device that will not do.
 
-        `serial_number` is that of the USB device which is the port, None if it has none.
+        `serial_number` and `product` are those of the USB device which is the port, None if it has none.
         """
 
     def close_steps(self, drain: bool) -> Steps:
@@ -121,6 +121,9 @@ class Adapter(Protocol):
 
     def saw_noise(self, noise: bytes) -> None:
         """Bytes that mean nothing came while the adapter is being initialised."""
+
+    def saw_text(self, text: bytes) -> None:
+        """A text came that answers no request, while the adapter does not run."""
 
     def read_report(self, text: bytes) -> Observation | None:
         """What the device said unasked; None if there is nothing to it. AdapterError as read_health."""

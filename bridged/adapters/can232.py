@@ -20,9 +20,10 @@ from bridged.adapters.base import (
 )
 from bridged.errors import AdapterError, WrongDeviceError
 from bridged.health import UNKNOWN, BusState, Happened, Observation
+from bridged.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Generator, Mapping, Sequence
 
     from bridged.config import Can232Config, ChannelConfig
 
@@ -53,6 +54,29 @@ FLUSH_PIECE = b"V" * 50
 FLUSH_PIECES = 4
 FLUSH_PAUSE_S = 0.06
 IDENTIFY_TRIES = 4  # the first V ends the line of the flush, which a CAN232 refuses
+
+# Other firmware than a CAN232's, by what it answers: V.
+NAMES_BY_VERSION = {
+    rb"VL2K.*": "a CANable with the firmware of Nakakiyo092",
+    rb"VW1K.*": "a USB2CANFDV1 with the firmware of Nakakiyo092",
+    rb"WeAct.*": "a WeAct USB2CANFDV1",
+    rb"\+Board.*": "a CANable with the firmware of Elmue",
+    rb".*(?i:canable|cantact).*": "a CANable with slcan firmware",
+}
+# V and N, which are the same in every device of that kind.
+NAMES_BY_NUMBERS = {
+    ("V0100", "FFFF"): "a USBtin",
+    ("V1013", "4242"): "slcanpty",
+    ("V1013", "A123"): "an Arduino with slcan firmware",
+    ("V1234", "1234"): "an Arduino with slcanuino",
+    ("V1234", "2233"): "an ESP32 with esp32-slcan",
+}
+# v, which a CAN232 refuses.
+NAMES_BY_DETAILS = {rb"v01\d\d": "a USBtin", rb"v0401": "a UCCB", rb"v: .*": "the firmware of Nakakiyo092"}
+# The buffer of this one overflows with more than 30 characters: the others after it are overwritten.
+CANTACT = "CANtact"  # "CANtact dev", "CANtact b12": USB product ad50:60c4
+LONGEST_SHOWN = 120
+HEARD_KEPT = 16
 
 # F, CAN232 manual: bit -> meaning. Bit 4 is not used.
 STATUS_FLAGS = {
@@ -89,6 +113,9 @@ class Can232:
         self._memory = memory
         self._is_can232 = adapter.firmware == "can232"  # the user says so
         self._flushed = self._is_can232  # no half command of another program is in the device's buffer
+        self._keep_off = False  # not a byte may be sent to what is there
+        self._heard: list[bytes] = []  # texts that answer no request, since V was asked first
+        self._noise = False  # was heard since then
         self._stamped = False
         self.identity = Identity()
         self.polling: Polling | None = None
@@ -111,17 +138,27 @@ class Can232:
 
     # --- start and end ------------------------------------------------------------------------
 
-    def init_steps(self, serial_number: str | None) -> Steps:  # noqa: ARG002 - it has one of its own (N)
-        """Flush, close, identify, configure, open (manual 1.4), then mend what its EEPROM has wrong."""
+    def init_steps(self, serial_number: str | None, product: str | None = None) -> Steps:  # noqa: ARG002
+        """Flush, identify, close, configure, open (manual 1.4), then mend what its EEPROM has wrong.
+
+        Its serial number is another than that of the USB device, and told by N.
+        """
         self.polling = None
+        self._keep_off = product is not None and product.startswith(CANTACT)
+        if self._keep_off:
+            msg = (
+                f"the USB device of {self._port} calls itself '{product}': no CAN232, and the "
+                f"first bytes of any flush would overwrite its memory, so nothing is sent to it"
+            )
+            raise WrongDeviceError(msg)
         if self._is_can232:
             yield from self._flush_can232()
+            yield from self._identify()
         else:
             self._flushed = False
             yield from self._flush()
-        yield from self._identify()
-        if not self._is_can232:
-            yield from self._close()
+            yield from self._identify()
+            yield from self._recognise()
         yield from self._configure()
         yield from self._open()
         auto_poll = yield from self._auto_poll()
@@ -142,6 +179,8 @@ class Can232:
         C throws away what is in the transmit FIFO, and those frames are answered: to drain it is to wait
         until they are on the bus, if others take up no more than half of it.
         """
+        if self._keep_off:
+            return
         if not self._flushed:  # nothing was sent to it yet but a part of the flush
             yield from self._flush()
             yield self.sync._replace(accept=ANYTHING, reject=())
@@ -158,7 +197,7 @@ class Can232:
     @property
     def last_words(self) -> bytes:
         """Nothing as long as a C might complete somebody's half command."""
-        return b"C\rC\r" if self._flushed else b""
+        return b"C\rC\r" if self._flushed and not self._keep_off else b""
 
     def _flush(self) -> Steps:
         """For a device of which nothing is known yet. The line is still to be ended, by `V`: a lone CR means
@@ -181,25 +220,21 @@ class Can232:
         yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
 
     def _identify(self) -> Steps:
-        for _ in range(IDENTIFY_TRIES):
-            answer = yield self._step(b"V\r", "tell its version", (TEXT, REFUSED, NONE), (), prefix=b"V")
+        self._heard, self._noise = [], False
+        replies = []
+        ask = self._step(b"V\r", "tell its version", (TEXT, REFUSED, NONE), (), prefix=b"V")
+        for number in range(IDENTIFY_TRIES):
+            # An empty line may be the late answer to something else, but not each time.
+            answer = yield ask._replace(accept=ANYTHING) if number == IDENTIFY_TRIES - 1 else ask
             self._flushed = True
+            replies.append(answer.reply)
             if answer.reply is TEXT:
                 break
         else:
-            if answer.reply is REFUSED:
-                msg = f"the adapter on {self._port} refuses every command, V too: is it a CAN232, and well?"
-                raise AdapterError(msg)
-            msg = (
-                f"no answer to V on {self._port} at {self.baudrate} Bd: is the adapter powered "
-                f"(from the CAN side, 6-16 V), the baud rate right (its LEDs blink it at power-on), "
-                f"the cable plugged?"
-            )
-            raise AdapterError(msg)
+            raise self._unidentified(replies)
         version = answer.text.decode("ascii", "replace")
         if not re.fullmatch("V[0-9A-F]{4}", version):
-            msg = f"the device on {self._port} answers V with {version!r}: not a CAN232 (Vhhss)"
-            raise WrongDeviceError(msg)
+            raise self._not_a_can232(answer.text)
         answer = yield self._step(b"N\r", "tell its serial number", (TEXT, REFUSED, NONE), (), prefix=b"N")
         serial = answer.text[1:].decode("ascii", "replace") if answer.reply is TEXT else None
         self.identity = Identity(version, serial)
@@ -209,6 +244,63 @@ class Can232:
                 f"adapter.serial_number wants {self._wanted_serial}"
             )
             raise WrongDeviceError(msg)
+
+    def _unidentified(self, replies: Sequence[Reply]) -> AdapterError:
+        """Why no answer to V begins with V. Noise may look like a text, but not always like the same one."""
+        text = max(self._heard, key=self._heard.count, default=b"")
+        if text and (not self._noise or self._heard.count(text) >= IDENTIFY_TRIES - 1):
+            return self._not_a_can232(text)
+        if REFUSED in replies:
+            return AdapterError(
+                f"the adapter on {self._port} refuses every command, V too: is it a CAN232, and well?"
+            )
+        if OK in replies:
+            return WrongDeviceError(f"the device on {self._port} answers V with an empty line: not a CAN232")
+        if self._noise:
+            return AdapterError(
+                f"only noise answers V on {self._port} at {self.baudrate} Bd: is the baud rate right "
+                f"(its LEDs blink it at power-on)?"
+            )
+        return AdapterError(
+            f"no answer to V on {self._port} at {self.baudrate} Bd: is the adapter powered "
+            f"(from the CAN side, 6-16 V), the baud rate right (its LEDs blink it at power-on), "
+            f"the cable plugged?"
+        )
+
+    def _not_a_can232(self, version: bytes) -> WrongDeviceError:
+        name = _name_of(version, NAMES_BY_VERSION)
+        what = f"probably {name}, not a CAN232" if name else "not a CAN232 (Vhhss)"
+        return WrongDeviceError(f"the device on {self._port} answers V with {_shown(version)}: {what}")
+
+    def _recognise(self) -> Steps:
+        """Refuses what answers V like a CAN232 and then gives itself away. The channel is closed then.
+
+        Asks only what no known firmware takes for an order: v, and F on a closed channel. (N is asked before,
+        without digits. X, W, U, Q, A, M1 write flash, registers or pins somewhere, or start a bootloader.)
+        """
+        version, serial = self.identity.version or "", self.identity.serial_number or ""
+        if name := NAMES_BY_NUMBERS.get((version, serial)):
+            raise self._clone(f"V with '{version}' and N with 'N{serial}'", name)
+        answer = yield self._step(
+            b"v\r", "tell its version in detail", (TEXT, REFUSED, NONE), (), prefix=b"v"
+        )
+        if answer.reply is TEXT:
+            name = _name_of(answer.text, NAMES_BY_DETAILS)
+            raise self._clone(f"v with {_shown(answer.text)}", name)
+        for _ in range(2):  # a CAN232 answers F, too, if C did not reach it
+            yield from self._close()
+            self._heard = []
+            answer = yield self._flags_step
+            flags = answer.text if answer.reply is TEXT else b"".join(self._heard[-1:])
+            if not flags:
+                return
+        raise self._clone(f"F with {_shown(flags)} while its channel is closed", None)
+
+    def _clone(self, seen: str, name: str | None) -> WrongDeviceError:
+        return WrongDeviceError(
+            f"the device on {self._port} answers {seen}: {f'probably {name}, ' if name else ''}not a CAN232, "
+            f"so it is not used; `firmware: can232` in section adapter takes it for one all the same"
+        )
 
     # --- settings -----------------------------------------------------------------------------
 
@@ -299,11 +391,23 @@ class Can232:
         self._remember("Z", 1)
         log.warning("adapter sends time stamps (Z1), a sixth of its line; switched off at the next start")
 
-    def saw_noise(self, noise: bytes) -> None:
-        """A wrong baud rate is noticed by the answers that are missing."""
+    def saw_noise(self, noise: bytes) -> None:  # noqa: ARG002
+        self._noise = True
+
+    def saw_text(self, text: bytes) -> None:
+        self._heard = [*self._heard[1 - HEARD_KEPT :], text]
 
     def read_report(self, text: bytes) -> Observation | None:  # noqa: ARG002 - it never speaks unasked
         return None
+
+
+def _name_of(answer: bytes, names: Mapping[bytes, str]) -> str | None:
+    return next((name for pattern, name in names.items() if re.fullmatch(pattern, answer)), None)
+
+
+def _shown(answer: bytes) -> str:
+    text = printable(answer.decode("ascii", "replace"))
+    return f"'{text}'" if len(text) <= LONGEST_SHOWN else f"'{text[:LONGEST_SHOWN]}…'"
 
 
 @functools.lru_cache(maxsize=16)

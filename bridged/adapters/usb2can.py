@@ -110,7 +110,7 @@ class Usb2can:
 
     # --- start and end ------------------------------------------------------------------------
 
-    def init_steps(self, serial_number: str | None) -> Steps:
+    def init_steps(self, serial_number: str | None, product: str | None = None) -> Steps:  # noqa: ARG002
         """The ten steps of chapter III; GET_MODE confirms a mode change, which nothing acknowledges."""
         self.flow = None
         self._noise.clear()
@@ -376,6 +376,9 @@ class Usb2can:
 
     def saw_noise(self, noise: bytes) -> None:
         self._noise += noise[: NOISE_KEPT - len(self._noise)]
+
+    def saw_text(self, text: bytes) -> None:
+        """A report of the time before: whoever speaks its protocol answers what it is asked."""
 
 
 def _wrong_mode(mode: int) -> str:

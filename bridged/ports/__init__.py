@@ -17,6 +17,7 @@ class Port(Protocol):
     fd: int
     description: str
     serial_number: str | None  # of the USB device that the port is; None: there is none, or it has none
+    product: str | None  # what that USB device calls itself; None as above
     failure: BridgeError | None  # why `fd` came to its end, where the descriptor itself cannot tell
 
     def close(self) -> None:

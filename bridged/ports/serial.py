@@ -92,6 +92,7 @@ class TtyPort:
             device.set_low_latency_mode(True)
         directory = sysfs.tty_directory(self.fd)
         self.serial_number = sysfs.serial_number(directory) if directory else None
+        self.product = sysfs.product(directory) if directory else None
         latency_ms = sysfs.latency_ms(directory) if directory else None
         if latency_ms is not None and latency_ms > 1:
             _log.warning("latency port=%s timer_ms=%d: each answer comes late", description, latency_ms)
@@ -115,6 +116,7 @@ class TcpPort:
     def __init__(self, url: str) -> None:
         self.description = url
         self.serial_number: str | None = None
+        self.product: str | None = None
         self.failure: BridgeError | None = None  # never set: read() tells
         try:
             parts = urlsplit(url)
@@ -153,6 +155,7 @@ class PumpedPort(Pump):
     def __init__(self, url: str, device: Any) -> None:
         super().__init__(url, socket.SOCK_STREAM)
         self.serial_number: str | None = None
+        self.product: str | None = None
         self._device = device
         connection = getattr(device, "_socket", None)  # pyserial has no public way to it
         if isinstance(connection, socket.socket):

@@ -27,10 +27,19 @@ def usb_directory(bus: int, ports: tuple[int, ...]) -> Path:
 
 def serial_number(directory: Path) -> str | None:
     """The serial number of the USB device that `directory` belongs to; None: it has none, or is not USB."""
+    return _usb_text(directory, "serial")
+
+
+def product(directory: Path) -> str | None:
+    """What the USB device that `directory` belongs to calls itself; None: it does not, or is not USB."""
+    return _usb_text(directory, "product")
+
+
+def _usb_text(directory: Path, name: str) -> str | None:
     for parent in (directory, *directory.parents):
         if (parent / "idVendor").exists():  # the device itself; further up are hubs
             with contextlib.suppress(OSError):
-                return printable((parent / "serial").read_text(errors="replace").strip()) or None
+                return printable((parent / name).read_text(errors="replace").strip()) or None
             return None
     return None
 

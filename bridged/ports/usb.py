@@ -78,6 +78,7 @@ class UsbPort(Pump):
     def __init__(self, url: str, chip: _Chip, serial_number: str | None) -> None:
         super().__init__(url, socket.SOCK_STREAM)
         self.serial_number = serial_number
+        self.product: str | None = None  # only FTDI's chips get so far
         self._chip = chip
         self._near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         self.start()

@@ -8,7 +8,7 @@
  * \r            CODEC_OK, but CODEC_SKIPPED when noise came just before it: it may be that line's end
  * z\r  Z\r      CODEC_SENT
  * \a            CODEC_REFUSED, wherever it comes; it ends a line that it interrupts, which is then skipped
- * V1013\r       CODEC_TEXT, and so is every other line of printable ASCII
+ * V1013\r       CODEC_TEXT, and so is every other line of printable ASCII and, but at its start, TABs
  * \n            CODEC_IDLE at the start of a line
  *
  * Everything else is CODEC_SKIPPED: noise between lines byte by byte, a line with noise in it as a whole, and
@@ -23,6 +23,7 @@
 enum {
     CR = '\r',
     LF = '\n',
+    TAB = '\t',
     BELL = '\a',
 
     SFF_DIGITS = 3,
@@ -171,7 +172,7 @@ static size_t line_decode(struct codec_state *state, const uint8_t *in, size_t n
     size_t end = 0;
     bool printable = true;
     while (end < limit && in[end] != CR && in[end] != BELL) {
-        printable = printable && is_printable(in[end]);
+        printable = printable && (is_printable(in[end]) || in[end] == TAB);
         end++;
     }
     if (end == CAN232_LINE_MAX) {

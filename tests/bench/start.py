@@ -180,10 +180,12 @@ class Bench:
         self.can = _has_can()
 
     def configure(
-        self, port: str, adapter: str = "can232", interval_s: float = 0.25, window: int = 1
+        self, port: str, adapter: str = "can232", interval_s: float = 0.25, window: int = 1, **keys: str
     ) -> Path:
         path = self.folder / "start.yaml"
-        adapter_keys = {"type": adapter, "port": port} | ({"baudrate": 115200} if adapter == "can232" else {})
+        adapter_keys: dict[str, object] = {"type": adapter, "port": port, **keys}
+        if adapter == "can232":
+            adapter_keys["baudrate"] = 115200
         path.write_text(
             f"adapter: {json.dumps(adapter_keys)}\nchannel: {{bitrate: 1000000}}\n"
             f"bus: {{channel: {INTERFACE}, create: true}}\nhealth: {{interval: {interval_s}}}\n"
@@ -338,7 +340,7 @@ def measure_start(bench: Bench, adapter: str, repeat: int) -> Iterator[Figure]:
 def measure_idle(bench: Bench, seconds: float) -> Iterator[Figure]:
     """A health poll wakes both threads twice: to ask, and for the answer. Nothing else should."""
     for interval_s in (0.5, 0.25):
-        config = bench.configure((adapter := Adapter()).path, interval_s=interval_s)
+        config = bench.configure((adapter := Adapter()).path, interval_s=interval_s, firmware="can232")
         with adapter, bench.bridge(config) as bridge:
             bridge.wait_running()
             time.sleep(SETTLE_S)
@@ -368,7 +370,10 @@ def _sleeper(rate: float, seconds: float) -> float:
 def measure_frames(bench: Bench, frames: int) -> Iterator[Figure]:
     """Memory before and after many frames, half of them each way; none may get lost."""
     _refuse_huge_pages()
-    with Adapter() as adapter, bench.bridge(bench.configure(adapter.path, window=WINDOW)) as bridge:
+    with (
+        Adapter() as adapter,
+        bench.bridge(bench.configure(adapter.path, window=WINDOW, firmware="can232")) as bridge,
+    ):
         bridge.wait_running()
         time.sleep(SETTLE_S)
         bus = bridge.connect()

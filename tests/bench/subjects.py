@@ -190,9 +190,10 @@ class Ours(Subject):
         slave = self._make_pty()
         self._socket = self.directory / f"{self.name}.sock"
         self._configuration = self.directory / f"{self.name}.yaml"
-        baudrate = ", baudrate: 115200" if self.adapter == "can232" else ""
+        # The adapter that somebody plays answers F always, as a CAN232 does only when it is open.
+        keys = ", baudrate: 115200, firmware: can232" if self.adapter == "can232" else ""
         self._configuration.write_text(
-            f"adapter: {{type: {self.adapter}, port: {slave}{baudrate}}}\nchannel: {{bitrate: 1000000}}\n"
+            f"adapter: {{type: {self.adapter}, port: {slave}{keys}}}\nchannel: {{bitrate: 1000000}}\n"
             f"bus: {{channel: {self.bus}}}\n{self.transmit}"
         )
 

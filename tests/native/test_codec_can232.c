@@ -239,6 +239,9 @@ static const struct decode_case decode_cases[] = {
     CASE("\x80\a\r", "skip1 refused ok"),
     CASE("\xFFt12\r\r", "skip5 ok"),
     CASE("\x1F \r\x1E~\r", "skip1 ' ' skip1 '~'"),
+    CASE("+A: B\tC: D\t\r", "'+A: B\tC: D\t'"),
+    CASE("\tV1013\r\tt1230\r\r", "skip1 'V1013' skip1 123# ok"),
+    CASE("t12\t30\r\r", "skip7 ok"),
 
     /* Noise within a line spoils the line. */
     CASE("t12\x00" "30\r\r", "skip7 ok"),

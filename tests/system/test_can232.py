@@ -28,6 +28,13 @@ def configuration(port: Path, bus: str, **transmit: Any) -> dict[str, Any]:
     }
 
 
+def for_slcanpty(port: Path, bus: str, **transmit: Any) -> dict[str, Any]:
+    """It would be recognised as no CAN232."""
+    settings = configuration(port, bus, **transmit)
+    settings["adapter"]["firmware"] = "can232"
+    return settings
+
+
 def balanced(status: dict[str, Any]) -> dict[str, Any]:
     """The counters, with the books checked: every frame that was read went somewhere."""
     counters: dict[str, Any] = status["counters"]
@@ -106,10 +113,19 @@ def test_both_ways_at_once_and_with_a_window_of_two(rig: Rig) -> None:
     bridge.stop_cleanly()
 
 
-def test_slcanpty_as_the_adapter(rig: Rig) -> None:
+def test_slcanpty_is_recognised(rig: Rig) -> None:
     near, far = rig.vcan(), rig.vcan()
     _, port = rig.slcanpty(far)
     bridge = rig.bridge(configuration(port, near))
+    reason = bridge.wait_state("fault")["reason"]
+    assert "answers V with 'V1013' and N with 'N4242': probably slcanpty, not a CAN232" in reason
+    bridge.stop_cleanly()
+
+
+def test_slcanpty_as_the_adapter(rig: Rig) -> None:
+    near, far = rig.vcan(), rig.vcan()
+    _, port = rig.slcanpty(far)
+    bridge = rig.bridge(for_slcanpty(port, near))
     assert bridge.wait_state("running")["adapter"]["version"] == "V1013"
     # It takes a remote frame's DLC for the next command: refuses that, and sends the frame with DLC 0.
     assert_carries(rig, bridge, near, far, gap_ms=1, remote_dlc="0")
@@ -120,7 +136,7 @@ def test_slcanpty_as_the_adapter(rig: Rig) -> None:
 def test_cansequence(rig: Rig, there: bool) -> None:
     near, far = rig.vcan(), rig.vcan()
     _, port = rig.slcanpty(far)
-    bridge = rig.bridge(configuration(port, near))
+    bridge = rig.bridge(for_slcanpty(port, near))
     bridge.wait_state("running")
     source, sink = (near, far) if there else (far, near)
     receiver = rig.start("stdbuf", "-oL", "cansequence", sink, "-r", "-q", "1", "-v")

@@ -44,8 +44,8 @@ class Host:
         self.now = 0.0
         self.written: list[bytes] = []
 
-    def start(self, steps_wanted: int = 1000) -> None:
-        self.perform(self.adapter.init_steps(None), steps_wanted)
+    def start(self, steps_wanted: int = 1000, product: str | None = None) -> None:
+        self.perform(self.adapter.init_steps(None, product), steps_wanted)
 
     def close(self, *, drain: bool = False) -> None:
         self.perform(self.adapter.close_steps(drain))
@@ -89,6 +89,8 @@ class Host:
         """Those that can be an answer; the others are told to the adapter."""
         for kind, text, _ in messages:
             if kind == "text" and not (prefix and text.startswith(prefix)):
-                continue
-            if kind in KINDS:
+                self.adapter.saw_text(text)
+            elif kind == "skipped":
+                self.adapter.saw_noise(text)
+            elif kind in KINDS:
                 yield KINDS[kind], text if kind == "text" else b""

@@ -305,7 +305,8 @@ class Elmue(Firmware):
     longest = 165
     version = (
         b"+Board: MksMakerbase\tMCU: STM32G431\tDevID: 1128\tFirmware: 2508001\tSlcan: 100\tClock: 160\t"
-        b"Limits: 512,256,128,128,32,32,16,16\tFeatures: 1023\tFilters: 8\tTimings: 4\tSerial: 207A3258"
+        b"Limits: 512,256,128,128,32,32,16,16\tFeatures: 1023\tFilters: 8\tTimings: 4\t"
+        b"Serial: 207A32585541500E"
     )
 
     def lone_cr(self) -> bytes:

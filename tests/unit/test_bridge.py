@@ -414,7 +414,8 @@ class PairPort:
 
     description = "pair"
     failure = None
-    serial_number = None
+    serial_number: str | None = None
+    product: str | None = None
 
     def __init__(self, kind: int = socket.SOCK_STREAM) -> None:
         self._near, self.far = socket.socketpair(socket.AF_UNIX, kind)

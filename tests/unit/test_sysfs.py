@@ -37,6 +37,13 @@ def test_serial_number(tty: Path) -> None:
     assert sysfs.serial_number(tty) is None  # and not the hub's
 
 
+def test_product(tty: Path) -> None:
+    (tty.parents[4] / "product").write_text("hub\n")
+    assert sysfs.product(tty) is None
+    (tty.parents[3] / "product").write_text("CANtact dev\n")
+    assert sysfs.product(tty) == "CANtact dev"
+
+
 def test_no_usb_device(machine: Path) -> None:
     assert sysfs.serial_number(machine) is None
 
