@@ -146,6 +146,11 @@ def _check_one(path: Path) -> None:
         f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
         f"to {bus.interface} {bus.channel}"
     )
+    if adapter.type == "can232":
+        from bridged.adapters.can232 import notes  # noqa: PLC0415
+
+        for note in notes(adapter, channel):
+            print(f"  {note}")
 
 
 def _status_paths(args: argparse.Namespace) -> list[Path]:

@@ -78,6 +78,19 @@ CANTACT = "CANtact"  # "CANtact dev", "CANtact b12": USB product ad50:60c4
 LONGEST_SHOWN = 120
 HEARD_KEPT = 16
 
+# What is kept in the EEPROM: what to ask of the adapter, and what it is good for; each value's name.
+EEPROM_PURPOSES = {
+    "X": ("send frames by itself", "it now sends received frames unasked"),
+    "Z": ("leave out time stamps", "received frames now take less of its line"),
+    "W": ("set the filter mode", "it now reads code and mask as channel.acceptance means them"),
+}
+EEPROM_NAMES = {
+    "X1": "auto poll",
+    "Z0": "no time stamps",
+    "W0": "filter mode dual",
+    "W1": "filter mode single",
+}
+
 # F, CAN232 manual: bit -> meaning. Bit 4 is not used.
 STATUS_FLAGS = {
     0: "receive FIFO full",
@@ -349,13 +362,13 @@ class Can232:
 
     def _write_eeprom(self, setting: str, value: int) -> Steps:
         """A firmware that refuses X is polled, one that refuses Z says nothing wrong; a filter must hold."""
-        purposes = {"X": "send frames by itself", "Z": "leave out time stamps", "W": "set the filter mode"}
+        purpose, effect = EEPROM_PURPOSES[setting]
         accept = (OK,) if setting == "W" else (OK, REFUSED)
         reject = tuple(reply for reply in (REFUSED, NONE) if reply not in accept)
         request = f"{setting}{value}"
-        answer = yield self._step(f"{request}\r".encode(), f"{purposes[setting]} ({request})", accept, reject)
+        answer = yield self._step(f"{request}\r".encode(), f"{purpose} ({request})", accept, reject)
         if answer.reply is OK:
-            log.info("wrote %s to the adapter's EEPROM: %s", request, purposes[setting])
+            log.info("stored '%s' (%s) in the adapter's EEPROM: %s", EEPROM_NAMES[request], request, effect)
             self._remember(setting, value)
         self._stamped = self._stamped and setting != "Z"
 
@@ -408,6 +421,19 @@ def _name_of(answer: bytes, names: Mapping[bytes, str]) -> str | None:
 def _shown(answer: bytes) -> str:
     text = printable(answer.decode("ascii", "replace"))
     return f"'{text}'" if len(text) <= LONGEST_SHOWN else f"'{text[:LONGEST_SHOWN]}…'"
+
+
+def notes(adapter: Can232Config, channel: ChannelConfig) -> list[str]:
+    """What somebody should know before the adapter is used with these settings."""
+    stored = ["X1", "Z0"]
+    acceptance = channel.acceptance
+    if acceptance is not None and not acceptance.passes_all:
+        stored.append(f"W{acceptance.single:d}")
+    names = ", ".join(f"{request} ({EEPROM_NAMES[request]})" for request in stored)
+    lines = [f"may store in the adapter's EEPROM, each only if it is not so already: {names}"]
+    if adapter.firmware is None:
+        lines.append("a clone that is recognised is refused at start, unless adapter.firmware is can232")
+    return lines
 
 
 @functools.lru_cache(maxsize=16)
