@@ -33,8 +33,8 @@ class Relay:
     Times are seconds. `window`: how many frames and commands may be unanswered. `deadline`: a frame
     older than this is not sent. `sync`: a command whose answer, a text that begins with `sync_prefix`,
     cannot be taken for any other answer; sent to find the thread again after an answer was lost.
-    Descriptors stay the caller's to close, after they were detached.
-    Raises ValueError for settings out of range, OSError when descriptors or memory run out.
+    Raises ValueError or OverflowError for what is out of range, OSError when descriptors or memory run out.
+    A child made by fork() must leave the relays of its parent alone: a lock may be held in it for ever.
     """
 
     def __new__(
@@ -61,7 +61,11 @@ class Relay:
     def fileno(self) -> int:
         """Readable when events() has something."""
     def attach_port(self, fd: int | _HasFileno, /) -> None:
-        """Talk to this non-blocking stream. Gates are closed: only commands go, frames are dropped."""
+        """Talk to this non-blocking stream. Gates are closed: only commands go, frames are dropped.
+
+        The relay uses a duplicate until it is detached; the caller closes its own, best after that: closing
+        the last one of a terminal may take long. OSError: nothing is attached.
+        """
     def detach_port(self) -> None: ...
     def cut(self) -> tuple[bool, bytes, int]:
         """After detach_port(): whether the device may not have read all frames; the message of which the port
@@ -70,7 +74,8 @@ class Relay:
         """After attach_port() of the same port: first the rest of the message of cut()."""
     def last_words(self, words: bytes, /) -> None:
         """Say this at once, behind the message that the port took in part; nothing else is sent any more."""
-    def attach_bus(self, fd: int | _HasFileno, /) -> None: ...
+    def attach_bus(self, fd: int | _HasFileno, /) -> None:
+        """Carry frames between the port and this socket; a duplicate and OSError as above."""
     def detach_bus(self) -> None: ...
     def hold_bus(self, held: bool, /) -> None:
         """While `held`, frames from the bus, and from one attached later, wait unread; those to it go on."""

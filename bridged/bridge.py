@@ -433,10 +433,15 @@ class Bridge:
         if isinstance(result, Exception):
             raise result
         self._plugged_in = False
+        try:
+            self._relay.attach_port(result.fd)
+        except OSError as error:  # no descriptor is left for it
+            self._kept.put_back(result)
+            self._dispatch(Event.OPEN_FAILED, f"{self._path}: cannot be used: {error.strerror}")
+            return
         self._port = result
         self._watch.opened(result.fd)
         self._sharing.opened(result.description, time.monotonic())
-        self._relay.attach_port(result.fd)
         self._kept.resume()
         self._dispatch(Event.OPENED)
 

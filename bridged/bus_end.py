@@ -50,18 +50,24 @@ class BusEnd:
         try:
             bus = self._open_bus()
         except BusError as error:
-            self._fails(logging.ERROR, f"bus not open: {error}")
-            self.retry_at = time.monotonic() + RETRY_S
+            self._not_open(str(error))
+            return
+        self.use(bus)
+        if self.bus is None:
             return
         self._is_well(f"bus open: {bus.description}")
-        self.use(bus)
         if bus.warning:
             self.on_down(bus.warning)
 
     def use(self, bus: Bus) -> None:
-        """An open bus of a bridge that ended."""
+        """An open bus, as that of a bridge that ended."""
+        try:
+            self._relay.attach_bus(bus.fd)
+        except OSError as error:  # no descriptor is left for it
+            self._not_open(f"{bus.description}: {error.strerror}")
+            bus.close()
+            return
         self.bus = bus
-        self._relay.attach_bus(bus.fd)
 
     def adopt(self, config: Config) -> None:
         """Other settings, but for the interface."""
@@ -164,6 +170,10 @@ class BusEnd:
             self._is_well(f"interface {channel} is up again")
         else:
             self.retry_at = time.monotonic() + RETRY_S
+
+    def _not_open(self, reason: str) -> None:
+        self._fails(logging.ERROR, f"bus not open: {reason}")
+        self.retry_at = time.monotonic() + RETRY_S
 
     def _fails(self, level: int, reason: str) -> None:
         self.reason = reason

@@ -69,6 +69,13 @@ class KeptPort:
         port, self._port = self._port, None
         return port
 
+    def put_back(self, port: Port) -> None:
+        """Where attach_port() failed: closes the port, or keeps it as it was for the next try."""
+        if self._unread:
+            self._port = port
+        else:
+            port.close()
+
     def resume(self) -> None:
         """After the relay's attach_port()."""
         if self._message:

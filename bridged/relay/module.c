@@ -53,6 +53,26 @@ static PyObject *relay_unlock_wake(struct relay *r)
     Py_RETURN_NONE;
 }
 
+static PyObject *raise_errno(int error)
+{
+    errno = error;
+    return PyErr_SetFromErrno(PyExc_OSError);
+}
+
+/* For "O&": PyArg_ParseTuple's own "I" takes 2**32 + 1 for 1. */
+static int uint32_from(PyObject *number, void *out)
+{
+    unsigned long long value = PyLong_AsUnsignedLongLong(number);
+    if (PyErr_Occurred())
+        return 0;
+    if (value > UINT32_MAX) {
+        PyErr_SetString(PyExc_OverflowError, "a number is 0 to 2**32 - 1");
+        return 0;
+    }
+    *(uint32_t *)out = (uint32_t)value;
+    return 1;
+}
+
 static int64_t seconds_to_ns(double seconds)
 {
     return (int64_t)(seconds * (double)NS_PER_S);
@@ -67,6 +87,10 @@ static bool seconds_valid(double seconds)
 /* Fills a command; prefix is how the text that answers begins, empty if none does. */
 static int command_init(struct command *c, const Py_buffer *data, int accept, const Py_buffer *prefix)
 {
+    if (accept & ~(ACCEPT_OK | ACCEPT_REFUSED)) {
+        PyErr_SetString(PyExc_ValueError, "accept is a sum of ACCEPT_ constants");
+        return -1;
+    }
     if (data->len < 1 || data->len > COMMAND_SIZE) {
         PyErr_Format(PyExc_ValueError, "a command has 1 to %d bytes, not %zd", COMMAND_SIZE, data->len);
         return -1;
@@ -84,8 +108,8 @@ static int command_init(struct command *c, const Py_buffer *data, int accept, co
 
 static int settings_check(const struct settings *s, double deadline, double answer_timeout)
 {
-    if (s->queue < 1 || s->window < 1 || s->window > WINDOW_MAX) {
-        PyErr_Format(PyExc_ValueError, "queue is 1 or more, window 1 to %d", WINDOW_MAX);
+    if (s->queue < 1 || s->queue > QUEUE_MAX || s->window < 1 || s->window > WINDOW_MAX) {
+        PyErr_Format(PyExc_ValueError, "queue is 1 to %d, window 1 to %d", QUEUE_MAX, WINDOW_MAX);
         return -1;
     }
     if (!seconds_valid(deadline) || !seconds_valid(answer_timeout)) {
@@ -104,8 +128,8 @@ static PyObject *Relay_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
     Py_buffer sync, prefix;
     RelayObject *self = NULL;
 
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$IIddy*y*:Relay", names, &codec, &set.queue, &set.window,
-                                     &deadline, &answer_timeout, &sync, &prefix))
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$O&O&ddy*y*:Relay", names, &codec, uint32_from, &set.queue,
+                                     uint32_from, &set.window, &deadline, &answer_timeout, &sync, &prefix))
         return NULL;
     set.codec = codec_by_name(codec);
     if (!set.codec || settings_check(&set, deadline, answer_timeout) < 0
@@ -141,10 +165,8 @@ static PyObject *Relay_run(PyObject *self, PyObject *Py_UNUSED(ignored))
     Py_BEGIN_ALLOW_THREADS
     error = relay_run(self_relay(self));
     Py_END_ALLOW_THREADS
-    if (error) {
-        errno = error;
-        return PyErr_SetFromErrno(PyExc_OSError);
-    }
+    if (error)
+        return raise_errno(error);
     Py_RETURN_NONE;
 }
 
@@ -199,8 +221,12 @@ static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
     if (fd < 0)
         return NULL;
     struct relay *r = relay_lock(self);
-    relay_attach_port(r, fd);
-    return relay_unlock_wake(r);
+    int error = relay_attach_port(r, fd);
+    relay_unlock(r);
+    relay_wake(r);
+    if (error)
+        return raise_errno(error);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_detach_port(PyObject *self, PyObject *Py_UNUSED(ignored))
@@ -260,14 +286,18 @@ static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
     if (fd < 0)
         return NULL;
     struct relay *r = relay_lock(self);
-    relay_attach_bus(r, fd);
-    return relay_unlock_wake(r);
+    int error = relay_attach_bus(r, fd);
+    relay_unlock(r);
+    relay_wake(r);
+    if (error)
+        return raise_errno(error);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_detach_bus(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
     struct relay *r = relay_lock(self);
-    relay_attach_bus(r, -1);
+    relay_detach_bus(r);
     return relay_unlock_wake(r);
 }
 
@@ -299,12 +329,12 @@ static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwarg
 
 static PyObject *Relay_set_queue(PyObject *self, PyObject *args)
 {
-    unsigned int size;
+    uint32_t size;
     double deadline;
-    if (!PyArg_ParseTuple(args, "Id:set_queue", &size, &deadline))
+    if (!PyArg_ParseTuple(args, "O&d:set_queue", uint32_from, &size, &deadline))
         return NULL;
-    if (size < 1 || !seconds_valid(deadline)) {
-        PyErr_SetString(PyExc_ValueError, "queue is 1 or more, deadline is seconds, more than 0");
+    if (size < 1 || size > QUEUE_MAX || !seconds_valid(deadline)) {
+        PyErr_Format(PyExc_ValueError, "queue is 1 to %d, deadline is seconds, more than 0", QUEUE_MAX);
         return NULL;
     }
     struct relay *r = relay_lock(self);
@@ -346,8 +376,8 @@ static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs
     static char *names[] = {"ask", "prefix", "capacity", "critical", "ready", NULL};
     struct flow flow = {0};
     Py_buffer ask, prefix;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "y*y*$III:set_flow", names, &ask, &prefix, &flow.capacity,
-                                     &flow.critical, &flow.ready))
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "y*y*$O&O&O&:set_flow", names, &ask, &prefix, uint32_from,
+                                     &flow.capacity, uint32_from, &flow.critical, uint32_from, &flow.ready))
         return NULL;
     int result = command_init(&flow.ask, &ask, 0, &prefix);
     if (!result && (flow.capacity < 1 || flow.capacity > UINT8_MAX || flow.critical > flow.capacity
@@ -368,13 +398,13 @@ static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"token", "data", "accept", "prefix", "timeout", "more", NULL};
     struct command c;
-    unsigned int token;
+    uint32_t token;
     Py_buffer data, prefix;
     int accept;
     double timeout;
     int more = 0;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Iy*iy*d|$p:command", names, &token, &data, &accept, &prefix,
-                                     &timeout, &more))
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "O&y*iy*d|$p:command", names, uint32_from, &token, &data,
+                                     &accept, &prefix, &timeout, &more))
         return NULL;
     int result = command_init(&c, &data, accept, &prefix);
     if (!result && !seconds_valid(timeout)) {

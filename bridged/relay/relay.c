@@ -2,6 +2,7 @@
 #include "relay.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <limits.h>
 #include <signal.h>
 #include <stdlib.h>
@@ -71,11 +72,30 @@ static int watch(struct relay *r, int operation, int fd, enum source source, uin
     return epoll_ctl(r->epoll_fd, operation, fd, &wanted) < 0 ? errno : 0;
 }
 
-/* It may be closed already, and is then not watched any more. */
 static void unwatch(struct relay *r, int fd)
 {
     if (fd >= 0)
         epoll_ctl(r->epoll_fd, EPOLL_CTL_DEL, fd, NULL);
+}
+
+/* To close ours is not enough: while its owner has one open it would be watched on. */
+static void let_go(struct relay *r, int *ours)
+{
+    unwatch(r, *ours);
+    if (*ours >= 0)
+        close(*ours);
+    *ours = -1;
+}
+
+/* A descriptor of our own for what `fd` is: whatever its owner does with that number, ours stays what it is.
+ * -> 0 or errno */
+static int take(struct relay *r, int *ours, int fd, enum source source, bool watched)
+{
+    *ours = fcntl(fd, F_DUPFD_CLOEXEC, 0);
+    int error = *ours < 0 ? errno : watched ? watch(r, EPOLL_CTL_ADD, *ours, source, EPOLLIN) : 0;
+    if (error)
+        let_go(r, ours);
+    return error;
 }
 
 struct relay *relay_new(const struct settings *set)
@@ -105,6 +125,8 @@ struct relay *relay_new(const struct settings *set)
 
 void relay_free(struct relay *r)
 {
+    let_go(r, &r->port);
+    let_go(r, &r->bus);
     if (r->wake_fd >= 0)
         close(r->wake_fd);
     if (r->event_fd >= 0)
@@ -158,8 +180,7 @@ static void bus_lost(struct relay *r, int error)
 {
     if (r->bus < 0)
         return;
-    unwatch(r, r->bus);
-    r->bus = -1;
+    let_go(r, &r->bus);
     relay_emit(r, EVENT_BUS_LOST, (uint32_t)error, NULL, 0);
 }
 
@@ -387,23 +408,20 @@ static int64_t bus_read(struct relay *r, struct moment turn, bool live)
 
 /* --- attach, detach: lock held --------------------------------------------------------------- */
 
-void relay_attach_port(struct relay *r, int fd)
+/* -> 0, or errno with none attached */
+int relay_attach_port(struct relay *r, int fd)
 {
     relay_detach_port(r);
     transmit_forget(r);
-    r->port = fd;
     r->port_full = false;
-    int error = watch(r, EPOLL_CTL_ADD, fd, PORT, EPOLLIN);
-    if (error)
-        relay_port_lost(r, error);
+    return take(r, &r->port, fd, PORT, true);
 }
 
-/* The descriptor stays its owner's to close. What it said in part is noise. */
+/* What it said in part is noise. */
 void relay_detach_port(struct relay *r)
 {
     r->attachments++;
-    unwatch(r, r->port);
-    r->port = -1;
+    let_go(r, &r->port);
     r->receiving = false;
     if (r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY)
         r->gate = GATE_AWAY;
@@ -418,17 +436,21 @@ void relay_detach_port(struct relay *r)
     transmit_reset(r);
 }
 
-void relay_attach_bus(struct relay *r, int fd)
+/* -> 0, or errno with none attached. Frames may wait in it, since the bridge before us had it: of those only their
+ * time stamps tell how old they are. */
+int relay_attach_bus(struct relay *r, int fd)
 {
     r->attachments++;
-    unwatch(r, r->bus);
-    r->bus = fd;
-    r->empty = (struct moment){0}; /* frames may wait in it since the bridge before us: their stamps are believed */
-    if (fd < 0)
-        rx_drop(r, r->rx_count, RX_BUS_LOST);
-    int error = fd >= 0 && !r->bus_held ? watch(r, EPOLL_CTL_ADD, fd, BUS, EPOLLIN) : 0;
-    if (error)
-        bus_lost(r, error);
+    let_go(r, &r->bus);
+    r->empty = (struct moment){0};
+    return take(r, &r->bus, fd, BUS, !r->bus_held);
+}
+
+void relay_detach_bus(struct relay *r)
+{
+    r->attachments++;
+    let_go(r, &r->bus);
+    rx_drop(r, r->rx_count, RX_BUS_LOST);
 }
 
 /* While `held` the bus is not read, whichever is attached: its frames wait in the socket, which stamps them. Those for

@@ -22,6 +22,7 @@
 enum {
     BUS_BATCH = 64,       /* frames per recvmmsg */
     RX_BATCH = 256,       /* frames per sendmmsg, and how many may wait for a full bus queue */
+    QUEUE_MAX = 65536,    /* frames that wait for the device, as configured */
     WINDOW_MAX = 32,      /* frames and commands unanswered, as configured */
     INFLIGHT_MAX = 64,    /* ring: WINDOW_MAX and the sync command behind them */
     RETRY_MAX = 64,       /* ring: refused frames wait here; never more than were in flight */
@@ -132,7 +133,7 @@ struct relay {
     int wake_fd;  /* eventfd: another thread changed something */
     int event_fd; /* eventfd: events to fetch */
     int epoll_fd; /* waits for wake_fd, port and bus */
-    int port, bus;
+    int port, bus; /* our own, -1: none */
     bool port_full; /* epoll_fd waits for room in the port, too */
     uint32_t attachments; /* counts attach and detach: results of a wait before one are void */
     enum gate gate;
@@ -203,9 +204,10 @@ int64_t relay_clock(void);
 int relay_run(struct relay *r);                    /* takes the lock; -> 0 or errno */
 int64_t relay_turn(struct relay *r, struct moment at); /* lock held; -> next deadline */
 void relay_wake(struct relay *r);
-void relay_attach_port(struct relay *r, int fd);
+int relay_attach_port(struct relay *r, int fd); /* a duplicate; -> 0 or errno */
 void relay_detach_port(struct relay *r);
-void relay_attach_bus(struct relay *r, int fd);
+int relay_attach_bus(struct relay *r, int fd); /* the same */
+void relay_detach_bus(struct relay *r);
 void relay_hold_bus(struct relay *r, bool held);
 void relay_emit(struct relay *r, enum event_kind kind, uint32_t token, const uint8_t *text, size_t length);
 void relay_port_lost(struct relay *r, int error);

@@ -90,7 +90,7 @@ static struct bench bench_new(const struct kind *kind, size_t taken)
         if (__real_write(b.far[1], &frame, sizeof frame) != sizeof frame)
             abort();
     }
-    relay_turn(b.relay, b.now);
+    relay_turn(b.relay, (struct moment){b.now, b.now});
     CHECK(wire_length == taken);
     return b;
 }
@@ -98,7 +98,7 @@ static struct bench bench_new(const struct kind *kind, size_t taken)
 static void bench_free(struct bench *b)
 {
     relay_detach_port(b->relay);
-    relay_attach_bus(b->relay, -1);
+    relay_detach_bus(b->relay);
     pthread_mutex_unlock(&b->relay->lock);
     relay_free(b->relay);
     for (int i = 0; i < 2; i++) {
@@ -113,7 +113,7 @@ static void bench_drain(struct bench *b)
 {
     room = sizeof wire - wire_length;
     b->now += 1000;
-    relay_turn(b->relay, b->now);
+    relay_turn(b->relay, (struct moment){b->now, b->now});
 }
 
 /* Whether the device got some frames, whole, then exactly this. */
@@ -164,7 +164,7 @@ static void test_resumed(const struct kind *kind, size_t taken, size_t more)
     static const struct command command = {.length = 4, .data = {0x0F, 0x12, 0x01, 0x00}, .timeout_ns = NS_PER_S};
     struct bench b = bench_new(kind, taken);
     b.now += DEADLINE_NS + 1;
-    relay_turn(b.relay, b.now);
+    relay_turn(b.relay, (struct moment){b.now, b.now});
     CHECK(bench_lost(&b));
     for (int i = 0; i < 2; i++) {
         struct cut cut = transmit_cut(b.relay);
@@ -174,12 +174,12 @@ static void test_resumed(const struct kind *kind, size_t taken, size_t more)
         transmit_command(b.relay, &command);
         room = i ? 0 : more;
         b.now += 1000;
-        relay_turn(b.relay, b.now);
+        relay_turn(b.relay, (struct moment){b.now, b.now});
         if (i) {
             bench_drain(&b);
         } else {
             b.now += NS_PER_S; /* the rest does not wait for ever, nor does the command */
-            relay_turn(b.relay, b.now);
+            relay_turn(b.relay, (struct moment){b.now, b.now});
             relay_detach_port(b.relay);
         }
     }
@@ -195,7 +195,7 @@ static void test_forgotten(const struct kind *kind, size_t taken)
 {
     struct bench b = bench_new(kind, taken);
     b.now += DEADLINE_NS + 1;
-    relay_turn(b.relay, b.now);
+    relay_turn(b.relay, (struct moment){b.now, b.now});
     bench_attach(&b);
     wire_length = 0;
     bench_drain(&b);

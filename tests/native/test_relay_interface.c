@@ -66,7 +66,7 @@ static struct bench bench_new(void)
 static void bench_free(struct bench *b)
 {
     relay_detach_port(b->relay);
-    relay_attach_bus(b->relay, -1);
+    relay_detach_bus(b->relay);
     pthread_mutex_unlock(&b->relay->lock);
     relay_free(b->relay);
     close(b->port);
@@ -85,7 +85,7 @@ static void bench_receive(struct bench *b, unsigned frames, int error, int times
     next_error = error;
     error_count = times;
     b->now += 1000;
-    relay_turn(b->relay, b->now);
+    relay_turn(b->relay, (struct moment){b->now, b->now});
 }
 
 static unsigned bench_delivered(struct bench *b)
@@ -123,7 +123,7 @@ static void test_full(unsigned frames, int error)
     CHECK(bench_delivered(&b) == 0);
     CHECK(b.relay->rx_count == frames);
     b.now += NS_PER_S / 100;
-    relay_turn(b.relay, b.now);
+    relay_turn(b.relay, (struct moment){b.now, b.now});
     CHECK(bench_delivered(&b) == frames);
     CHECK(b.relay->count.rx_dropped[RX_BUS_FULL] == 0);
     bench_free(&b);

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -484,6 +485,21 @@ def test_the_plug_is_pulled_in_the_moment_that_ends_a_state(
 
     run_until(bridge, ended)
     thread.join()
+    stopped(bridge)
+
+
+def test_a_port_that_the_relay_cannot_take_is_closed_and_tried_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where no descriptor is left; here it is a file, for which epoll does not wait."""
+    file = (bench.folder / "file").open("w")
+    port = SimpleNamespace(fd=file.fileno(), failure=None, serial_number=None, close=file.close)
+    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bridge = bench.bridge()
+    bridge.start()
+    run_until(bridge, lambda: bridge.state in {State.BACKOFF, State.WAITING})
+    assert bridge.reason == f"{bench.link}: cannot be used: Operation not permitted"
+    assert file.closed
     stopped(bridge)
 
 

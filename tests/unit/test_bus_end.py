@@ -34,8 +34,11 @@ class Relay:
 
     def __init__(self) -> None:
         self.bus = -1
+        self.error = 0
 
     def attach_bus(self, fd: int) -> None:
+        if self.error:
+            raise OSError(self.error, os.strerror(self.error))
         self.bus = fd
 
     def detach_bus(self) -> None:
@@ -134,6 +137,23 @@ def test_lost_and_opened_again(bench: Bench, caplog: pytest.LogCaptureFixture) -
     assert (end.bus, end.reason, end.next_at) == (bench.buses[1], "", None)
     assert end.lost_frames() == {"socket-overflow": 6}
     assert lines(caplog) == ["bus open: pair"]
+
+
+@pytest.mark.parametrize("handed_over", [False, True])
+def test_out_of_descriptors(bench: Bench, caplog: pytest.LogCaptureFixture, handed_over: bool) -> None:
+    end = bench.end
+    bench.relay.error = errno.EMFILE
+    if handed_over:
+        end.use(bench.open())
+    else:
+        end.open()
+    assert (end.bus, end.reason) == (None, "bus not open: pair: Too many open files")
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(bench.buses[0].fd)
+    bench.relay.error = 0
+    bench.pass_time(RETRY_S)
+    assert (end.bus, end.reason, end.next_at) == (bench.buses[1], "", None)
+    assert lines(caplog) == ["bus not open: pair: Too many open files", "bus open: pair"]
 
 
 def test_down_and_up_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:

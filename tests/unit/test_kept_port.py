@@ -207,3 +207,16 @@ def test_a_port_that_has_come_to_its_end_is_not_kept(ends: Callable[[socket.sock
         bridge.kept.release(bridge.port)
         assert bridge.port.fd == -1
         assert bridge.kept.take() is None
+
+
+@pytest.mark.parametrize("cut", [20, None])
+def test_a_port_that_the_relay_could_not_have_is_what_it_was_before(cut: int | None) -> None:
+    with rig_with() as rig:
+        bridge = Bridge(rig, cut)
+        port = bridge.kept.take()
+        assert port is not None
+        bridge.kept.put_back(port)
+        assert bridge.kept.take() is port  # open, with what it holds
+        bridge.kept.runs()
+        bridge.kept.put_back(port)
+        assert (port.fd, bridge.kept.take()) == (-1, None)

@@ -87,5 +87,5 @@ def test_a_queue_of_another_size_keeps_the_oldest(rig: Rig, queue: int, kept: in
 
 @pytest.mark.parametrize(("queue", "deadline"), [(0, 1.0), (1, 0.0), (1, float("nan"))])
 def test_a_queue_that_is_none_is_refused(rig: Rig, queue: int, deadline: float) -> None:
-    with pytest.raises(ValueError, match="queue is 1 or more"):
+    with pytest.raises(ValueError, match="queue is 1 to 65536"):
         rig.relay.set_queue(queue, deadline)
