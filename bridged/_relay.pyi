@@ -103,6 +103,9 @@ class Relay:
     def tally(self) -> tuple[int, int, int, int, int]:
         """Of the counters: decoded, rx_frames, tx_frames, rx_overruns, skipped_bytes; for frequent looks."""
 
+    def glimpse(self) -> tuple[bytes, bytes]:
+        """A frame that came from the bus lately and one that went to it; zeros before there is one."""
+
     def counters(self) -> dict[str, int | dict[str, int]]:
         """A snapshot between two turns: bus_read = tx_frames + queued + the sum of tx_dropped."""
 

@@ -83,6 +83,7 @@ class Bridge:
         self.config = config
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
+        self.circle = ""  # what neighbours.py has found
         self._told = Told()
         self.finished = False
         # Whether the adapter's channel may be open, as far as its answers tell; None: it was never asked.
@@ -254,9 +255,22 @@ class Bridge:
             self._on_bus_off("bus-off")
         return True
 
+    def rates(self) -> dict[str, float]:
+        """Frames a second each way."""
+        return self._polling.rates()
+
+    def frames_read(self) -> int:
+        """From the bus, by this bridge alone."""
+        read: Any = self._relay.counters()["bus_read"]
+        return int(read)
+
+    def glimpse(self) -> tuple[bytes, bytes]:
+        """A frame that came from the bus lately and one that went to it."""
+        return self._relay.glimpse()
+
     def condition(self) -> tuple[State, str, bool]:
         """The state, the reason why it is not running, whether the bus is open."""
-        reason = "; ".join(filter(None, (self.reason, self._bus_end.reason)))
+        reason = "; ".join(filter(None, (self.reason, self._bus_end.reason, self.circle)))
         return self.state, reason, self._bus_end.bus is not None
 
     def snapshot(self) -> dict[str, Any]:

@@ -16,10 +16,12 @@ from bridged.lifecycle import State
 from bridged.notify import Notifier
 
 if TYPE_CHECKING:
+    from pathlib import Path
     from types import FrameType
 
     from bridged.bridge import Bridge
     from bridged.config import Config
+    from bridged.neighbours import Neighbours
     from bridged.status import StatusServer
 
 log = logging.getLogger(__name__)
@@ -95,12 +97,15 @@ class Service:
         self._told: tuple[object, ...] = ()
         self._refusal = ""  # why the last reload was refused
         self._feed_at: float | None = None
+        self._own_socket: Path | None = None
+        self._neighbours: Neighbours | None = None
 
     def run(self, status: StatusServer | None = None) -> None:
         """Runs until a signal has stopped it and the adapter is closed."""
         with _signals() as signals, selectors.DefaultSelector() as selector:
             selector.register(signals[0], selectors.EVENT_READ, lambda: self._on_signals(*signals))
             if status is not None:
+                self._own_socket = status.path
                 selector.register(status, selectors.EVENT_READ, status.on_readable)
             self._watch(selector)
             self._ready_at = time.monotonic() + READY_LIMIT_S
@@ -133,6 +138,18 @@ class Service:
         if not self.bridge.finished:
             self.bridge.on_timer(time.monotonic())
         self._feed(time.monotonic())
+        self._look_around(time.monotonic())
+
+    def _look_around(self, now: float) -> None:
+        if self._own_socket is None or self.bridge.finished:
+            return
+        if self._neighbours is None:
+            if self.bridge.state is not State.RUNNING:
+                return
+            from bridged.neighbours import Neighbours  # noqa: PLC0415 - never at the cost of the start
+
+            self._neighbours = Neighbours(self._own_socket)
+        self._neighbours.look(self.bridge, now)
 
     # --- signals ------------------------------------------------------------------------------
 

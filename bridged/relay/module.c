@@ -469,6 +469,16 @@ static PyObject *Relay_counters(PyObject *self, PyObject *Py_UNUSED(ignored))
     return counters_dict(&count, queued, pending);
 }
 
+/* The buffers of the last batch each way; bytes of a message that was no frame may be among them. */
+static PyObject *Relay_glimpse(PyObject *self, PyObject *Py_UNUSED(ignored))
+{
+    struct relay *r = relay_lock(self);
+    struct can_frame from_bus = r->bus_message[0].frame.classic, to_bus = r->rx[0];
+    pthread_mutex_unlock(&r->lock);
+    return Py_BuildValue("y#y#", (const char *)&from_bus, (Py_ssize_t)sizeof from_bus, (const char *)&to_bus,
+                         (Py_ssize_t)sizeof to_bus);
+}
+
 static PyObject *Relay_tally(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
     struct relay *r = relay_lock(self);
@@ -499,6 +509,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"events", Relay_events, METH_NOARGS, NULL},
     {"counters", Relay_counters, METH_NOARGS, NULL},
     {"tally", Relay_tally, METH_NOARGS, NULL},
+    {"glimpse", Relay_glimpse, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

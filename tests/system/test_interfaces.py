@@ -186,3 +186,19 @@ def test_a_usb_device_is_known_by_its_serial_number(rig: Rig) -> None:
     bridge.wait_state("running")
     wait_log(bridge, f"{right.wait_tty()} has the serial number that is wanted, not {wrong.wait_tty()}")
     bridge.stop_cleanly()
+
+
+def test_two_bridges_whose_adapters_share_a_can_bus_are_told_of_it(rig: Rig) -> None:
+    """Frames go in a circle, and both logs and both states say so; a single frame starts it."""
+    near, far = rig.vcan(), rig.vcan()
+    bridges = []
+    for name in ("a", "b"):
+        _, port = rig.simulate(far)
+        bridges.append(rig.bridge(configuration(port, near), name))
+        bridges[-1].wait_state("running")
+    rig.cansend(near, "123#01")
+    for bridge, other in zip(bridges, ("b", "a"), strict=True):
+        wait_log(bridge, f"{near} is also fed by bridge '{other}'")
+        wait_log(bridge, "frames go in a circle between ")
+        assert "their adapters are on the same CAN bus" in bridge.snapshot()["reason"]
+        assert bridge.snapshot()["state"] == "running"
