@@ -1,6 +1,7 @@
 /* bridged._relay: the relay for Python. */
 #include "module.h"
 
+#include <assert.h>
 #include <errno.h>
 #include <string.h>
 #include <unistd.h>
@@ -21,6 +22,9 @@ static const struct {
     {"WINDOW_MAX", WINDOW_MAX},
 };
 
+enum { EVENTS_BATCH = 32 }; /* taken at once, with the lock */
+static_assert(EVENTS_MAX % EVENTS_BATCH == 0, "events() returns EVENTS_MAX at most");
+
 typedef struct {
     PyObject_HEAD
     struct relay *relay;
@@ -32,23 +36,17 @@ static struct relay *self_relay(PyObject *self)
 }
 
 /* The loop thread holds the lock only for one turn, never waits with it and never needs the GIL. */
-static struct relay *relay_lock(PyObject *self)
+static struct relay *locked(PyObject *self)
 {
     struct relay *r = self_relay(self);
-    pthread_mutex_lock(&r->lock);
+    relay_lock(r);
     return r;
 }
 
-static PyObject *relay_unlock(struct relay *r)
-{
-    pthread_mutex_unlock(&r->lock);
-    Py_RETURN_NONE;
-}
-
 /* After a change that the loop must see. */
-static PyObject *relay_unlock_wake(struct relay *r)
+static PyObject *unlock_wake(struct relay *r)
 {
-    pthread_mutex_unlock(&r->lock);
+    relay_unlock(r);
     relay_wake(r);
     Py_RETURN_NONE;
 }
@@ -189,9 +187,9 @@ static PyObject *Relay_turn(PyObject *self, PyObject *args)
     struct moment at = {0};
     if (!PyArg_ParseTuple(args, "O&|O&:turn", clock_from, &at.boot_ns, clock_from, &at.wall_ns))
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     int64_t next = relay_turn(r, at);
-    pthread_mutex_unlock(&r->lock);
+    relay_unlock(r);
     if (next == NEVER)
         Py_RETURN_NONE;
     return PyLong_FromLongLong(next);
@@ -199,9 +197,9 @@ static PyObject *Relay_turn(PyObject *self, PyObject *args)
 
 static PyObject *Relay_stop(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     r->stop = true;
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_wake(PyObject *self, PyObject *Py_UNUSED(ignored))
@@ -220,7 +218,7 @@ static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
     int fd = PyObject_AsFileDescriptor(arg);
     if (fd < 0)
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     int error = relay_attach_port(r, fd);
     relay_unlock(r);
     relay_wake(r);
@@ -231,14 +229,14 @@ static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
 
 static PyObject *Relay_detach_port(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     relay_detach_port(r);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_cut(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     const struct cut cut = transmit_cut(r);
     bool unread = r->unread;
     relay_unlock(r);
@@ -264,9 +262,9 @@ static PyObject *Relay_resume(PyObject *self, PyObject *args)
         PyErr_SetString(PyExc_ValueError, "resume takes what cut() gave, of which a part was taken");
         return NULL;
     }
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     transmit_resume(r, &cut);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_last_words(PyObject *self, PyObject *arg)
@@ -274,10 +272,10 @@ static PyObject *Relay_last_words(PyObject *self, PyObject *arg)
     Py_buffer words;
     if (PyObject_GetBuffer(arg, &words, PyBUF_SIMPLE) < 0)
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     transmit_last_words(r, words.buf, (size_t)words.len);
     PyBuffer_Release(&words);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
@@ -285,7 +283,7 @@ static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
     int fd = PyObject_AsFileDescriptor(arg);
     if (fd < 0)
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     int error = relay_attach_bus(r, fd);
     relay_unlock(r);
     relay_wake(r);
@@ -296,9 +294,9 @@ static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
 
 static PyObject *Relay_detach_bus(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     relay_detach_bus(r);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_hold_bus(PyObject *self, PyObject *arg)
@@ -306,9 +304,9 @@ static PyObject *Relay_hold_bus(PyObject *self, PyObject *arg)
     int held = PyObject_IsTrue(arg);
     if (held < 0)
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     relay_hold_bus(r, held);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwargs)
@@ -321,10 +319,10 @@ static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwarg
         PyErr_SetString(PyExc_ValueError, "transmit is one of the GATE_ constants");
         return NULL;
     }
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     r->receiving = receiving;
     queue_set_gate(r, (enum gate)gate);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_set_queue(PyObject *self, PyObject *args)
@@ -337,11 +335,11 @@ static PyObject *Relay_set_queue(PyObject *self, PyObject *args)
         PyErr_Format(PyExc_ValueError, "queue is 1 to %d, deadline is seconds, more than 0", QUEUE_MAX);
         return NULL;
     }
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     int error = queue_resize(r, size);
     if (!error)
         r->set.deadline_ns = seconds_to_ns(deadline);
-    pthread_mutex_unlock(&r->lock);
+    relay_unlock(r);
     if (error)
         return PyErr_NoMemory();
     relay_wake(r);
@@ -364,11 +362,11 @@ static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
     PyBuffer_Release(&prefix);
     if (result < 0)
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     r->poll = c;
     r->poll_interval_ns = seconds_to_ns(interval);
     r->poll_at_ns = 0;
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs)
@@ -389,9 +387,9 @@ static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs
     PyBuffer_Release(&prefix);
     if (result < 0)
         return NULL;
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     flow_start(r, &flow);
-    return relay_unlock_wake(r);
+    return unlock_wake(r);
 }
 
 static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
@@ -417,11 +415,14 @@ static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
         return NULL;
     c.token = token;
     c.timeout_ns = seconds_to_ns(timeout);
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     bool taken = r->port >= 0 && transmit_command(r, &c);
     if (!taken) /* no port, or more commands waiting than can ever be meant */
         relay_emit(r, EVENT_TIMEOUT, token, NULL, 0);
-    return more ? relay_unlock(r) : relay_unlock_wake(r);
+    if (!more)
+        return unlock_wake(r);
+    relay_unlock(r);
+    Py_RETURN_NONE;
 }
 
 static PyObject *event_object(const struct event *e)
@@ -429,40 +430,48 @@ static PyObject *event_object(const struct event *e)
     return Py_BuildValue("(iIy#)", e->kind, e->token, (const char *)e->text, (Py_ssize_t)e->length);
 }
 
+/* -> how many events are in `batch`: the oldest, EVENTS_BATCH at most */
+static uint32_t take_events(PyObject *self, struct event *batch)
+{
+    struct relay *r = locked(self);
+    uint32_t n = r->event_count < EVENTS_BATCH ? r->event_count : EVENTS_BATCH;
+    for (uint32_t i = 0; i < n; i++)
+        batch[i] = r->events[(r->event_head + i) % EVENTS_MAX];
+    r->event_head = (r->event_head + n) % EVENTS_MAX;
+    r->event_count -= n;
+    relay_unlock(r);
+    return n;
+}
+
+/* At most EVENTS_MAX, or a flood would keep the caller here. They are all that there were when the eventfd was reset;
+ * what has come since made it readable again. */
 static PyObject *Relay_events(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
+    struct event batch[EVENTS_BATCH];
     PyObject *list = PyList_New(0);
     if (!list)
         return NULL;
-    struct relay *r = self_relay(self);
     uint64_t value;
-    ssize_t ignored = read(r->event_fd, &value, sizeof value);
+    ssize_t ignored = read(self_relay(self)->event_fd, &value, sizeof value);
     (void)ignored;
-    for (;;) {
-        struct event e;
-        pthread_mutex_lock(&r->lock);
-        bool some = r->event_count > 0;
-        if (some) {
-            e = r->events[r->event_head];
-            r->event_head = (r->event_head + 1) % EVENTS_MAX;
-            r->event_count--;
-        }
-        relay_unlock(r);
-        if (!some)
-            return list;
-        PyObject *item = event_object(&e);
-        if (!item || PyList_Append(list, item) < 0) {
+    for (uint32_t taken = 0, n = EVENTS_BATCH; n == EVENTS_BATCH && taken < EVENTS_MAX; taken += n) {
+        n = take_events(self, batch);
+        for (uint32_t i = 0; i < n; i++) {
+            PyObject *item = event_object(&batch[i]);
+            int result = item ? PyList_Append(list, item) : -1;
             Py_XDECREF(item);
-            Py_DECREF(list);
-            return NULL;
+            if (result < 0) {
+                Py_DECREF(list);
+                return NULL;
+            }
         }
-        Py_DECREF(item);
     }
+    return list;
 }
 
 static PyObject *Relay_counters(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     const struct counters count = r->count;
     uint64_t queued = transmit_queued(r), pending = r->rx_count;
     relay_unlock(r);
@@ -481,7 +490,7 @@ static PyObject *Relay_glimpse(PyObject *self, PyObject *Py_UNUSED(ignored))
 
 static PyObject *Relay_tally(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     const struct counters c = r->count;
     relay_unlock(r);
     return Py_BuildValue("(KKKKK)", c.decoded, c.delivered, c.confirmed, c.overruns, c.skipped_bytes);

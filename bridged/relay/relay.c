@@ -117,6 +117,7 @@ struct relay *relay_new(const struct settings *set)
         errno = error;
         return NULL;
     }
+    pthread_mutex_init(&r->turnstile, NULL);
     pthread_mutex_init(&r->lock, NULL);
     message_headers_init(r);
     transmit_reset(r);
@@ -135,6 +136,20 @@ void relay_free(struct relay *r)
         close(r->epoll_fd);
     free(r->queue);
     free(r);
+}
+
+/* A thread that gives a mutex back and takes it again at once, as the loop does under a flood, is always faster than
+ * one that waits for it. At the turnstile it must queue behind that one. */
+void relay_lock(struct relay *r)
+{
+    pthread_mutex_lock(&r->turnstile);
+    pthread_mutex_lock(&r->lock);
+    pthread_mutex_unlock(&r->turnstile);
+}
+
+void relay_unlock(struct relay *r)
+{
+    pthread_mutex_unlock(&r->lock);
 }
 
 /* An eventfd is full only after 2^64 writes nobody read: the result cannot matter. */
@@ -388,7 +403,7 @@ static int64_t bus_read(struct relay *r, struct moment turn, bool live)
     int error = n < 0 ? errno : 0;
     const struct moment now = live ? moment_now() : turn;
     if (error == ENETDOWN) {
-        r->empty = (struct moment){0};
+        r->empty = (struct moment){0, r->empty.wall_ns - r->empty.boot_ns};
         relay_emit(r, EVENT_BUS_DOWN, 0, NULL, 0);
     } else if (error && error != EINTR && error != EAGAIN) {
         bus_lost(r, error);
@@ -437,12 +452,13 @@ void relay_detach_port(struct relay *r)
 }
 
 /* -> 0, or errno with none attached. Frames may wait in it, since the bridge before us had it: of those only their
- * time stamps tell how old they are. */
+ * time stamps tell how old they are, and how the clocks differ at this moment. */
 int relay_attach_bus(struct relay *r, int fd)
 {
+    const struct moment now = moment_now();
     r->attachments++;
     let_go(r, &r->bus);
-    r->empty = (struct moment){0};
+    r->empty = (struct moment){0, now.wall_ns - now.boot_ns};
     return take(r, &r->bus, fd, BUS, !r->bus_held);
 }
 
@@ -511,9 +527,9 @@ static unsigned int wait_ready(struct relay *r, struct moment turn, int64_t unti
     int64_t wait_ns = until == NEVER ? NEVER : until > turn.boot_ns ? until - turn.boot_ns : 0;
     watch_room(r);
     uint32_t attachments = r->attachments;
-    pthread_mutex_unlock(&r->lock);
+    relay_unlock(r);
     long n = wait_epoll(r->epoll_fd, ready, wait_ns);
-    pthread_mutex_lock(&r->lock);
+    relay_lock(r);
     r->count.turns++;
     unsigned int sources = 0;
     for (long i = 0; i < n; i++)
@@ -560,7 +576,7 @@ int relay_run(struct relay *r)
     sigset_t all, before;
     sigfillset(&all);
     pthread_sigmask(SIG_BLOCK, &all, &before); /* signals are for Python's main thread */
-    pthread_mutex_lock(&r->lock);
+    relay_lock(r);
     int result = r->running ? EBUSY : 0;
     if (!result) {
         r->running = true;
@@ -573,7 +589,7 @@ int relay_run(struct relay *r)
         }
         r->running = r->stop = false;
     }
-    pthread_mutex_unlock(&r->lock);
+    relay_unlock(r);
     pthread_sigmask(SIG_SETMASK, &before, NULL);
     return result;
 }

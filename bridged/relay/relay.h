@@ -2,7 +2,7 @@
  *
  * One thread runs relay_run(). Everything in struct relay is guarded by `lock`, which that thread
  * holds all the time except while it waits. So any other thread that takes the lock sees
- * the relay between two turns: the counters of a snapshot add up.
+ * the relay between two turns: the counters of a snapshot add up. Each takes it by relay_lock(), in turn.
  *
  *   frames read from the bus = confirmed + dropped (by reason) + queued
  *   frames decoded from the port = put on the bus + dropped (by reason) + pending
@@ -127,7 +127,8 @@ struct cut {
 };
 
 struct relay {
-    pthread_mutex_t lock; /* guards all below */
+    pthread_mutex_t turnstile; /* held while waiting for `lock` */
+    pthread_mutex_t lock;      /* guards all below */
     struct settings set;
     bool stop, running;
     int wake_fd;  /* eventfd: another thread changed something */
@@ -190,7 +191,7 @@ struct relay {
     } bus_message[BUS_BATCH];
     struct iovec bus_iov[BUS_BATCH];
     struct mmsghdr bus_msg[BUS_BATCH];
-    struct moment empty; /* no frame from before it is in the bus's socket any more; 0: not known yet */
+    struct moment empty; /* no frame from before it is in the bus's socket any more; boot_ns 0: not known */
 
     struct event events[EVENTS_MAX];
     uint32_t event_head, event_count;
@@ -201,6 +202,8 @@ struct relay {
 struct relay *relay_new(const struct settings *set); /* NULL with errno */
 void relay_free(struct relay *r);
 int64_t relay_clock(void);
+void relay_lock(struct relay *r);
+void relay_unlock(struct relay *r);
 int relay_run(struct relay *r);                    /* takes the lock; -> 0 or errno */
 int64_t relay_turn(struct relay *r, struct moment at); /* lock held; -> next deadline */
 void relay_wake(struct relay *r);

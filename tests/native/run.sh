@@ -62,6 +62,9 @@ for cc in gcc clang; do
     options="-D_GNU_SOURCE -pthread -Wl,--wrap=write"
     # shellcheck disable=SC2086
     run_test relay_cut $parts
+    options="-D_GNU_SOURCE -pthread"
+    # shellcheck disable=SC2086
+    run_test relay_lock $parts
     options=
 done
 if [ "$compilers" = 0 ]; then

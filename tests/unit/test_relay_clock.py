@@ -11,8 +11,12 @@ from collections.abc import Iterator
 import pytest
 from test_relay import MS, Rig, can_frame, number_of
 
+from bridged import _relay
+
 S = 1_000 * MS
-START = 10_000 * S
+START = (
+    _relay.clock() // 2
+)  # another time than the real one, which the relay may know from when it was attached
 DEADLINE_MS = 500
 TIMESTAMPNS = 35  # SO_ and SCM_
 HOUR_MS = 3_600_000
@@ -96,6 +100,12 @@ class TestFirst:
         rig.turn_at(0, rig.oldest_stamp() + age * MS)
         assert rig.sent() == [1] * sent
         assert rig.counters()["stale"] == (not sent)
+
+    def test_the_clock_is_set_back_before_the_first_look(self, rig: ClockRig) -> None:
+        rig.bus.send(can_frame(1))
+        rig.relay.attach_bus(rig.far[1])
+        rig.relay.turn(_relay.clock() + 700 * MS, rig.oldest_stamp() + 400 * MS)
+        assert rig.counters()["stale"] == 1
 
     def test_what_was_known_of_the_socket_before_is_forgotten(self, rig: ClockRig) -> None:
         rig.turn_at(0, time.time_ns() - 5 * S)

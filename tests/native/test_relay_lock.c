@@ -1,0 +1,69 @@
+/* The relay's lock: a loop that gives it back and takes it again at once does not starve another thread. */
+#include "../../bridged/relay/relay.h"
+
+#include <sched.h>
+#include <stdatomic.h>
+#include <stdlib.h>
+
+#include "check.h"
+
+enum { ROUNDS = 100, PATIENCE_S = 20 };
+
+static struct relay *relay;
+static atomic_bool came; /* the other thread is about to take the lock */
+static bool had_it;      /* guarded by the relay's lock */
+
+static void *other(void *unused)
+{
+    atomic_store(&came, true);
+    relay_lock(relay);
+    had_it = true;
+    relay_unlock(relay);
+    return unused;
+}
+
+/* Whether a thread is at the turnstile, at last; not for ever, or a lock without one would hang this test. */
+static bool somebody_waits(void)
+{
+    int64_t end = relay_clock() + PATIENCE_S * NS_PER_S;
+    while (relay_clock() < end) {
+        if (atomic_load(&came)) {
+            if (pthread_mutex_trylock(&relay->turnstile))
+                return true;
+            pthread_mutex_unlock(&relay->turnstile);
+        }
+        sched_yield();
+    }
+    return false;
+}
+
+static bool is_next(void)
+{
+    pthread_t thread;
+    atomic_store(&came, false);
+    relay_lock(relay);
+    had_it = false;
+    if (pthread_create(&thread, NULL, other, NULL))
+        abort();
+    bool waits = somebody_waits();
+    relay_unlock(relay);
+    relay_lock(relay);
+    bool next = waits && had_it;
+    relay_unlock(relay);
+    pthread_join(thread, NULL);
+    return next;
+}
+
+int main(void)
+{
+    const struct settings set = {.codec = &codec_can232, .queue = 1, .window = 1};
+    relay = relay_new(&set);
+    if (!relay)
+        abort();
+    int i = 0;
+    while (i < ROUNDS && is_next())
+        i++;
+    CHECK(i == ROUNDS);
+    relay_free(relay);
+    return checks_end();
+}
