@@ -481,7 +481,7 @@ static PyObject *Relay_counters(PyObject *self, PyObject *Py_UNUSED(ignored))
 /* The buffers of the last batch each way; bytes of a message that was no frame may be among them. */
 static PyObject *Relay_glimpse(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = relay_lock(self);
+    struct relay *r = locked(self);
     struct can_frame from_bus = r->bus_message[0].frame.classic, to_bus = r->rx[0];
     pthread_mutex_unlock(&r->lock);
     return Py_BuildValue("y#y#", (const char *)&from_bus, (Py_ssize_t)sizeof from_bus, (const char *)&to_bus,
