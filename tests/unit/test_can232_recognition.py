@@ -166,6 +166,20 @@ def test_an_open_can232_that_did_not_hear_the_first_c() -> None:
     assert b"O\r" in host.written
 
 
+def test_the_end_of_a_line_that_began_before_us_is_no_answer() -> None:
+    class Talking(Reference):
+        rest = b"1122\r"
+
+        def take_output(self, now: float) -> bytes:
+            rest = self.rest if now > 0.06 else b""
+            self.rest = self.rest[len(rest) :]
+            return super().take_output(now) + rest
+
+    host = Host(Talking(is_open=True), adapter_for())
+    host.start()
+    assert b"O\r" in host.written
+
+
 @pytest.mark.parametrize("product", ["CANtact dev", "CANtact b12"])
 def test_not_a_byte_for_a_cantact(product: str) -> None:
     for options in ({}, {"firmware": "can232"}):
