@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from rig import Bridge, Candump, Rig, wait_until
-from test_can232 import balanced, for_slcanpty
+from test_can232 import balanced, taken_for_can232
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -28,7 +28,7 @@ class Bench:
     def __init__(self, rig: Rig) -> None:
         self.near, far = rig.vcan(), rig.vcan()
         _, port = rig.slcanpty(far)
-        self.bridge: Bridge = rig.bridge(for_slcanpty(port, self.near, queue=1024, deadline=0.5))
+        self.bridge: Bridge = rig.bridge(taken_for_can232(port, self.near, queue=1024, deadline=0.5))
         self.bridge.wait_state("running")
         self.arrived: Candump = rig.candump(far)
         self.program = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)

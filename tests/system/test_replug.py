@@ -86,8 +86,14 @@ def assert_sent(lives: list[Life], born: dict[str, float], counters: dict[str, A
 
 @pytest.mark.parametrize(
     ("adapter", "raw", "cycles"),
-    [("can232", False, 50), ("usb2can", False, 25), ("usb2can", True, 25)],
-    ids=["can232", "usb2can", "usb2can-libusb"],
+    [
+        pytest.param("can232", False, 8, id="can232"),
+        pytest.param("usb2can", False, 8, id="usb2can"),
+        pytest.param("usb2can", True, 8, id="usb2can-libusb"),
+        pytest.param("can232", False, 50, id="can232-50", marks=pytest.mark.long),
+        pytest.param("usb2can", False, 25, id="usb2can-25", marks=pytest.mark.long),
+        pytest.param("usb2can", True, 25, id="usb2can-libusb-25", marks=pytest.mark.long),
+    ],
 )
 def test_unplug_and_plug_while_frames_flow(rig: Rig, adapter: str, raw: bool, cycles: int) -> None:
     """Frames STEADY#… go all the time; of the BURST#… many still wait when the cable is pulled."""
