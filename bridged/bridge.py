@@ -356,9 +356,13 @@ class Bridge:
         if self.state is State.BUS_OFF:
             reason = f"the bridge has taken the adapter off its CAN bus: {self.reason}"
         self.reason = reason or (self.reason if self.state in AFTERMATH else "")
-        times = self._told.tell(reason, time.monotonic()) if reason else None
+        now = time.monotonic()
+        times = self._told.tell(reason, now) if reason else None
         if times is not None:
-            log.warning("state=%s: %s%s", self.state.value, reason, repeated(times))
+            again = ""
+            if self.state in {State.CLOSING, State.BACKOFF} and not self._bus_off.sets_pause:
+                again = f"; trying again in {self._backoff.coming_s(now):.2g} s"
+            log.warning("state=%s: %s%s%s", self.state.value, reason, again, repeated(times))
             return
         quiet = self._told.quiet if self.state is State.RUNNING else self._told.failing
         always = self.state in {State.STOPPING, State.STOPPED, State.BUS_OFF}

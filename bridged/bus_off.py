@@ -51,6 +51,11 @@ class BusOff:
         self._discarded = 0  # of the adapter's, those told
         self._told = Told()
 
+    @property
+    def sets_pause(self) -> bool:
+        """Whether the next pause is not the back-off's."""
+        return self._pause_s is not None
+
     def take_pause_s(self) -> float | None:
         """How long the next pause is to be, once; None: the back-off decides."""
         pause_s, self._pause_s = self._pause_s, None

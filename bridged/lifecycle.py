@@ -175,8 +175,12 @@ class Backoff:
         """The adapter runs, until next_s() or longest_s() is called."""
         self._running_since = now
 
+    def coming_s(self, now: float) -> float:
+        """What next_s() will give, but for the jitter."""
+        return self._initial_s if self._was_stable(now) else self._next_s
+
     def next_s(self, now: float) -> float:
-        if self._running_since is not None and now - self._running_since >= STABLE_S:
+        if self._was_stable(now):
             self.hurry()
         self._running_since = None
         delay = self._next_s
@@ -190,6 +194,9 @@ class Backoff:
 
     def hurry(self) -> None:
         self._next_s = self._initial_s
+
+    def _was_stable(self, now: float) -> bool:
+        return self._running_since is not None and now - self._running_since >= STABLE_S
 
     def _with_jitter(self, delay_s: float) -> float:
         return delay_s * (1 - JITTER * self._random())

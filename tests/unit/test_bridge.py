@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import re
 import select
 import socket
 import struct
@@ -270,6 +271,7 @@ def test_silence_is_told_then_ends(bench: Bench, caplog: pytest.LogCaptureFixtur
     device.silent = False
     run_until(bridge, lambda: bridge.state is State.RUNNING)
     assert "no answer from the adapter: resynchronising" in caplog.text
+    assert re.search("state=closing: the adapter stopped answering; trying again in [0-9.]+ s", caplog.text)
     stopped(bridge)
 
 

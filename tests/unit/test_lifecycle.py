@@ -101,6 +101,7 @@ def test_only_a_stable_run_makes_pauses_short_again(ran_s: float, pause_s: float
     for _ in range(3):
         backoff.next_s(1000.0)
     backoff.runs(1000.0)
+    assert backoff.coming_s(1000.0 + ran_s) == pause_s
     assert backoff.next_s(1000.0 + ran_s) == pause_s
     assert backoff.next_s(5000.0) == 2 * pause_s  # it did not run since
 
