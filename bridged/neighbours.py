@@ -8,15 +8,17 @@ else sends), some frames of each direction are compared. The frames themselves g
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bridged.lifecycle import State, Told, repeated
 from bridged.status import StatusError, query
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from bridged.bridge import Bridge
@@ -64,15 +66,26 @@ class Neighbours:
             self._asked, self._beside, self._search_at = {}, {}, now
         if now >= self._search_at:
             self._search_at = now + SEARCH_INTERVAL_S
-            self._run(self._search, bridge)
+            if strangers := self._strangers():
+                self._run(self._ask, bridge, strangers)
         elif self._is_suspect(bridge):
             self._run(self._compare, bridge)
 
-    def _run(self, task: Any, bridge: Bridge) -> None:
-        self._thread = threading.Thread(target=task, args=(bridge,), name="neighbours", daemon=True)
+    def _run(self, task: Callable[..., None], *arguments: object) -> None:
+        self._thread = threading.Thread(target=task, args=arguments, name="neighbours", daemon=True)
         self._thread.start()
 
     # --- in the thread of the bridge ----------------------------------------------------------
+
+    def _strangers(self) -> dict[Path, int]:
+        """Status sockets that were not asked yet, with their inodes."""
+        found = {}
+        for path in sorted(self._own.parent.glob("*.sock")):
+            with contextlib.suppress(OSError):  # it is just being removed
+                inode = path.lstat().st_ino
+                if path != self._own and self._asked.get(path) != inode:
+                    found[path] = inode
+        return found
 
     def _is_suspect(self, bridge: Bridge) -> bool:
         rates = bridge.rates()
@@ -87,20 +100,20 @@ class Neighbours:
 
     # --- in their own -------------------------------------------------------------------------
 
-    def _search(self, bridge: Bridge) -> None:
-        """Tells of bridges on the same interface that were not asked yet."""
+    def _ask(self, bridge: Bridge, strangers: dict[Path, int]) -> None:
+        """Tells of those that are on the same interface."""
         bus = bridge.config.bus
-        for path in sorted(self._own.parent.glob("*.sock")):
+        for path, inode in strangers.items():
             try:
-                inode = path.lstat().st_ino
-                if path == self._own or self._asked.get(path) == inode:
-                    continue
                 status = query(path)
-            except (OSError, StatusError):  # it ends, or is none of ours: asked again at the next search
+            except StatusError:  # it ends, or is none of ours: asked again at the next search
                 continue
             self._asked[path] = inode
-            interface = status.get("bus", {})
-            if (interface.get("interface"), interface.get("channel")) == (bus.interface, bus.channel):
+            theirs = status.get("bus")
+            if isinstance(theirs, dict) and (theirs.get("interface"), theirs.get("channel")) == (
+                bus.interface,
+                bus.channel,
+            ):
                 self._beside[path] = name = str(status.get("name"))
                 log.warning(
                     "%s is also fed by bridge %r: each sends what the other's adapter receives, so these two "
@@ -143,7 +156,7 @@ class Neighbours:
         for path, name in list(self._beside.items()):
             try:
                 frames[name] = int(query(path)["counters"]["rx_frames"])
-            except (OSError, StatusError, KeyError, TypeError, ValueError):
+            except (StatusError, KeyError, TypeError, ValueError):
                 self._beside.pop(path)  # it has ended
         return frames
 
