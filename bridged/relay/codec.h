@@ -29,6 +29,12 @@ struct codec_message {
     size_t length;         /* CODEC_TEXT: length in bytes. CODEC_SKIPPED: how many bytes are skipped */
 };
 
+/* What no codec exceeds, so that buffers have their size; each asserts it of its own. */
+enum {
+    CODEC_LINE_MAX = 256, /* line_max */
+    CODEC_FRAME_MAX = 64, /* frame_max */
+};
+
 enum { CODEC_KEPT_MAX = 20 }; /* bytes of the longest message of a binary protocol */
 
 /* What a decoder must remember between two calls; zero it to start. */

@@ -18,6 +18,7 @@
  */
 #include "codec.h"
 
+#include <assert.h>
 #include <string.h>
 
 enum {
@@ -37,6 +38,8 @@ enum {
     HEX = 0x10, /* marks a hex digit in hex_table, whose low four bits are its value */
     NIBBLE = 0x0F,
 };
+static_assert((int)CAN232_LINE_MAX <= (int)CODEC_LINE_MAX, "a line does not fit");
+static_assert((int)CAN232_FRAME_MAX <= (int)CODEC_FRAME_MAX, "a frame does not fit");
 
 static const uint8_t hex_table[256] = {
     ['0'] = HEX | 0,  ['1'] = HEX | 1,  ['2'] = HEX | 2,  ['3'] = HEX | 3,  ['4'] = HEX | 4,  ['5'] = HEX | 5,

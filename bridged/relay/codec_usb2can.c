@@ -63,6 +63,8 @@ enum {
 };
 
 static_assert((int)MESSAGE_MAX <= (int)CODEC_KEPT_MAX, "codec_state keeps any message");
+static_assert((int)USB2CAN_LINE_MAX <= (int)CODEC_LINE_MAX, "a message does not fit");
+static_assert(HEAD + FRAME_BYTES_MAX <= (int)CODEC_FRAME_MAX, "a frame does not fit");
 
 enum { NONE = -1, MORE = 0 }; /* instead of a length: no message; perhaps one, but not all of it is there */
 

@@ -483,7 +483,7 @@ static PyObject *Relay_glimpse(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
     struct relay *r = locked(self);
     struct can_frame from_bus = r->bus_message[0].frame.classic, to_bus = r->rx[0];
-    pthread_mutex_unlock(&r->lock);
+    relay_unlock(r);
     return Py_BuildValue("y#y#", (const char *)&from_bus, (Py_ssize_t)sizeof from_bus, (const char *)&to_bus,
                          (Py_ssize_t)sizeof to_bus);
 }

@@ -80,7 +80,7 @@ PyObject *module_encode(PyObject *Py_UNUSED(module), PyObject *args)
     const struct codec *codec = codec_by_name(name);
     struct can_frame frame;
     if (codec && data.len == sizeof frame) {
-        uint8_t out[64];
+        uint8_t out[CODEC_FRAME_MAX];
         memcpy(&frame, data.buf, sizeof frame);
         result = PyBytes_FromStringAndSize((const char *)out, (Py_ssize_t)codec->encode(&frame, out));
     } else if (codec) {

@@ -10,6 +10,7 @@
 #ifndef CAN_BRIDGE_RELAY_H
 #define CAN_BRIDGE_RELAY_H
 
+#include <assert.h>
 #include <pthread.h>
 #include <sys/socket.h>
 
@@ -27,7 +28,7 @@ enum {
     INFLIGHT_MAX = 64,    /* ring: WINDOW_MAX and the sync command behind them */
     RETRY_MAX = 64,       /* ring: refused frames wait here; never more than were in flight */
     COMMANDS_MAX = 32,    /* ring: commands from Python that wait for their turn */
-    COMMAND_SIZE = 64,    /* bytes of one command */
+    COMMAND_SIZE = 64,    /* bytes of one command, and of one frame as it is sent */
     PREFIX_MAX = 4,       /* bytes by which a text is known to be a command's answer */
     EVENTS_MAX = 256,     /* ring: events that Python has not fetched yet */
     EVENTS_NEWS = 128,    /* of these for what nobody waits for; the rest is for answers and losses */
@@ -36,6 +37,9 @@ enum {
     OUT_BUFFER = 4096,    /* bytes encoded and not taken by the port yet */
     SYNC_TRIES = 3,       /* unanswered sync commands until the adapter counts as silent */
 };
+
+static_assert((int)CODEC_FRAME_MAX <= (int)COMMAND_SIZE, "the room for a command is room for a frame");
+static_assert((int)CODEC_LINE_MAX <= (int)PORT_BUFFER, "a message waits in `in` until all of it is there");
 
 /* What happens to frames read from the bus. */
 enum gate { GATE_AWAY, GATE_OPEN, GATE_LISTEN_ONLY, GATE_STOPPED, GATES };

@@ -493,7 +493,7 @@ void transmit_pump(struct relay *r, int64_t now)
     if (r->out_start || r->port < 0)
         return;
     queue_expire(r, now);
-    while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now))
+    while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now)) /* a command or a frame */
         ;
     out_flush(r);
 }
