@@ -13,6 +13,7 @@ import socket
 import stat
 import struct
 import termios
+import threading
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -36,6 +37,7 @@ _OWN_TERMINAL: Final = os.makedev(5, 0)  # /dev/tty: another name for the contro
 _INT: Final = struct.Struct("=i")
 _LINGER: Final = struct.Struct("=ii")
 
+_CLOSE_LIMIT_S: Final = 0.5
 _CONNECT_LIMIT_S: Final = 5.0
 # A peer that vanishes without a word is noticed after 10 s: silence and 3 probes, or data unacknowledged.
 _TCP_OPTIONS: Final = (
@@ -98,12 +100,18 @@ class TtyPort:
             _log.warning("latency port=%s timer_ms=%d: each answer comes late", description, latency_ms)
 
     def close(self) -> None:
-        self.fd = -1
-        if self._device.is_open:
-            # close() waits 30 s (closing_wait) for a device that takes no more bytes, unless there are none.
-            with contextlib.suppress(termios.error):
-                termios.tcflush(self._device.fileno(), termios.TCIOFLUSH)
-            self._device.close()
+        if self.fd < 0:
+            return
+        fd, self.fd = self.fd, -1
+        with contextlib.suppress(termios.error):
+            termios.tcflush(fd, termios.TCIOFLUSH)
+        # ftdi_sio throws no bytes away: the kernel waits up to 30 s (closing_wait) until the device takes them.
+        # A thread that waits so ends with the process, at once.
+        thread = threading.Thread(target=self._device.close, name=f"close {self.description}", daemon=True)
+        thread.start()
+        thread.join(_CLOSE_LIMIT_S)
+        if thread.is_alive():
+            _log.warning("port=%s is still being closed: its device takes no bytes", self.description)
 
 
 class TcpPort:

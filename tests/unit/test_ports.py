@@ -141,6 +141,29 @@ class TestTty:
                 arrived += len(block)
         assert arrived <= 4096 < written  # 4096 the master has
 
+    def test_close_does_not_wait_for_a_driver_that_waits(
+        self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        _, path = pty_pair
+        port = open_port(path, 57600)
+        assert isinstance(port, ports.TtyPort)
+        device, taken = port._device, threading.Event()
+
+        def close() -> None:
+            taken.wait(LIMIT_S)
+            serial.Serial.close(device)
+
+        monkeypatch.setattr(device, "close", close)
+        monkeypatch.setattr(ports, "_CLOSE_LIMIT_S", 0.001)
+        port.close()
+        assert "is still being closed: its device takes no bytes" in caplog.text
+        assert device.is_open
+        taken.set()
+        for thread in threading.enumerate():
+            if thread.name.startswith("close "):
+                thread.join(LIMIT_S)
+        assert not device.is_open
+
     def test_close_after_a_hang_up(self, pty_pair: tuple[int, str]) -> None:
         master, path = pty_pair
         port = open_port(path, 57600)
