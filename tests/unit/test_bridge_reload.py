@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 from books import check_books
 from test_bridge import FRAME, Bench, run_until, started, stopped
+from test_bridge_usb2can import Usb2canBench
 
 from bridged.bridge import Bridge
 from bridged.buses.socketcan import receive_stamped
@@ -29,15 +31,15 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 class Traffic:
     """A frame each INTERVAL_S, numbered by its identifier."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, far: socket.socket) -> None:
+        self._far = far
         self._began = time.monotonic()
         self.sent = 0
 
     def __call__(self) -> int:
         """Sends what is due; how many it has sent."""
         while time.monotonic() - self._began >= self.sent * INTERVAL_S:
-            self._bench.bus.far.send(FRAME.pack(self.sent, 0, b""))
+            self._far.send(FRAME.pack(self.sent, 0, b""))
             self.sent += 1
         return self.sent
 
@@ -55,9 +57,23 @@ def after(seconds: float) -> Callable[[], bool]:
     return lambda: time.monotonic() >= end
 
 
-def test_no_frame_is_lost_under_traffic_and_the_counters_go_on(bench: Bench) -> None:
-    traffic = Traffic(bench)
-    bridges = [started(bench.bridge(transmit="{deadline: 1.0}"))]
+@pytest.fixture
+def usb2can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Usb2canBench]:
+    with contextlib.closing(Usb2canBench(tmp_path, monkeypatch)) as made:
+        made.device_plugged_in()
+        yield made
+
+
+@pytest.mark.parametrize("adapter", ["can232", "usb2can"])
+def test_no_frame_is_lost_under_traffic_and_the_counters_go_on(
+    adapter: str, request: pytest.FixtureRequest
+) -> None:
+    bench: Bench = request.getfixturevalue("bench" if adapter == "can232" else adapter)
+    bridges = [bench.bridge(transmit="{deadline: 1.0}")]
+    receive_stamped(bench.bus._near)
+    traffic = Traffic(bench.bus.far)
+    started(bridges[0])
+    run_until(bridges[0], lambda: traffic() and bridges[0].state is State.RUNNING)
     for window in itertools.islice(itertools.cycle((2, 1)), 3):
         old = bridges[-1]
         run_until(old, lambda goal=traffic.sent + 30: traffic() >= goal)  # type: ignore[misc]
@@ -74,6 +90,7 @@ def test_no_frame_is_lost_under_traffic_and_the_counters_go_on(bench: Bench) -> 
     status = stopped(new)
     counters = status["counters"]
     assert [frame.can_id for frame in bench.frames] == list(range(traffic.sent))
+    assert counters["reconnects"] == 0
     assert counters["bus_read"] == traffic.sent
     assert sum(counters["tx_dropped"].values()) == 0
     assert status["uptime_s"] >= (traffic.sent - 1) * INTERVAL_S
