@@ -105,7 +105,7 @@ class TtyPort:
         fd, self.fd = self.fd, -1
         with contextlib.suppress(termios.error):
             termios.tcflush(fd, termios.TCIOFLUSH)
-        # ftdi_sio throws no bytes away: the kernel waits up to 30 s (closing_wait) until the device takes them.
+        # ftdi_sio throws no bytes away: the kernel waits for the device to take them, 30 s (closing_wait).
         # A thread that waits so ends with the process, at once.
         thread = threading.Thread(target=self._device.close, name=f"close {self.description}", daemon=True)
         thread.start()
