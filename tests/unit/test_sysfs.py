@@ -109,11 +109,22 @@ def test_a_bridge_is_named(tmp_path: Path, command: str, name: str) -> None:
 def test_ports_that_are_no_usb_devices() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = open_port(f"socket://127.0.0.1:{listener.getsockname()[1]}", 57600)
-        assert port.serial_number is None
+        assert (port.serial_number, port.product) == (None, None)
         port.close()
     port = open_port("loop://", 57600)
-    assert port.serial_number is None
+    assert (port.serial_number, port.product) == (None, None)
     port.close()
+
+
+def test_a_port_tells_the_product_of_its_device(tty: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tty.parents[3] / "product").write_text("CANtact dev\n")
+    monkeypatch.setattr(sysfs, "tty_directory", lambda _fd: tty)
+    terminal, line = os.openpty()
+    port = open_port(os.ttyname(line), 57600)
+    assert (port.serial_number, port.product) == ("A6001234", "CANtact dev")
+    port.close()
+    os.close(terminal)
+    os.close(line)
 
 
 def test_a_serial_number_has_no_control_characters(tty: Path) -> None:
