@@ -8,7 +8,7 @@ cp -r "$top/pyproject.toml" "$top/README.md" "$top/LICENSE" "$top/bridged" "$top
 rm -f "$work"/bridged/*.so
 cd "$work"
 /usr/bin/python3 -m venv venv
-venv/bin/pip install -q --disable-pip-version-check .
+venv/bin/pip install -q --disable-pip-version-check . msgpack  # which the example with udp_multicast needs
 cd /
 for file in can-bridge@.service can-bridge.sysusers 70-can-bridge.rules network.conf; do
     [ -s "$work/venv/share/can-bridge/systemd/$file" ] || { echo "not installed: $file" >&2; exit 1; }
