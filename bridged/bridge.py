@@ -158,7 +158,8 @@ class Bridge:
         else:
             self._holds_bus = True
             self._relay.hold_bus(True)
-            self._bus_end.use(bus)
+            assert predecessor is not None
+            self._bus_end.use(bus, predecessor._bus_end.reason)
         self._start_with_bus()
 
     def stop(self, successor: Config | None = None) -> None:

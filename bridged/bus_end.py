@@ -59,8 +59,8 @@ class BusEnd:
         if bus.warning:
             self.on_down(bus.warning)
 
-    def use(self, bus: Bus) -> None:
-        """An open bus, as that of a bridge that ended."""
+    def use(self, bus: Bus, reason: str = "") -> None:
+        """An open bus, as that of a bridge that ended; `reason` why it carries nothing: it is down."""
         try:
             self._relay.attach_bus(bus.fd)
         except OSError as error:  # no descriptor is left for it
@@ -68,6 +68,9 @@ class BusEnd:
             bus.close()
             return
         self.bus = bus
+        if reason:
+            self.reason = reason
+            self.retry_at = time.monotonic() + RETRY_S
 
     def adopt(self, config: Config) -> None:
         """Other settings, but for the interface."""
@@ -144,8 +147,8 @@ class BusEnd:
             self._put(self._limit.add(frame, time.monotonic()))
 
     def hand_over(self) -> Bus | None:
-        """The open bus, for a successor's use(); None: there is none, or it is down, which open() tells."""
-        if self.bus is None or self.reason:
+        """The open bus, for a successor's use(), with `reason`; None: there is none."""
+        if self.bus is None:
             return None
         self._put(self._limit.take(math.inf))
         self._relay.detach_bus()

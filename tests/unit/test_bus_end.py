@@ -246,8 +246,20 @@ def test_handed_over(bench: Bench) -> None:
     bench.end.use(bus)
     assert bench.relay.bus == bus.fd
     bench.end.on_down()
-    assert bench.end.hand_over() is None
-    assert bench.end.bus is bus
+    assert bench.end.hand_over() is bus
+
+
+def test_handed_over_while_down(bench: Bench) -> None:
+    """Frames of before may still wait in it; and that it is up again must be noticed."""
+    bench.end.open()
+    bench.end.on_down()
+    bus: Any = bench.end.hand_over()
+    bench.end.use(bus, bench.end.reason)
+    bench.pass_time(2 * RETRY_S)
+    assert bench.end.reason == DOWN
+    bench.up = True
+    bench.pass_time(RETRY_S)
+    assert (bench.end.reason, bench.end.next_at) == ("", None)
 
 
 def test_is_up() -> None:
