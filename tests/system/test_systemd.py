@@ -5,6 +5,7 @@ They install themselves into the machine, so only in our own.
 
 import contextlib
 import json
+import re
 import shutil
 import socket
 import subprocess
@@ -206,6 +207,21 @@ class TestUnit:
         execute("ip", "link", "add", "dev", made.interface, "type", "vcan")
         execute("ip", "link", "set", made.interface, "up")
         made.wait_status("waiting: ")
+
+    def test_without_an_adapter(self) -> None:
+        """The commands of systemd/README.md, the last of which shows five frames of a simulated adapter."""
+        (text,) = re.findall(
+            r"## Try the service without an adapter\n.*?```sh\n(.*?)```",
+            (FILES / "README.md").read_text(),
+            re.DOTALL,
+        )
+        try:
+            said = execute("sh", "-euc", f"cd {FILES}; {text}")
+            assert said.count(" vcan0 ") == 5, said
+            assert "running" in execute("can-bridge", "status", "simulated")
+        finally:
+            execute("systemctl", "stop", "can-bridge@simulated", "simulated-adapter", status=None)
+            execute("ip", "link", "delete", "vcan0", status=None)
 
     def test_restart(self, can232: Instance) -> None:
         pid = can232.pid

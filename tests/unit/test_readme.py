@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from bridged import _relay, cli, config
+from bridged.lifecycle import State
 from bridged.status import LOST_BEFORE_READ
 
 TOP = Path(__file__).parents[2]
@@ -50,6 +51,11 @@ def test_every_linked_file_exists() -> None:
 def test_every_error_text_is_one_of_ours(text: str) -> None:
     for part in re.split(r"(?<=refused to) | dialout", text):  # put together at run time
         assert part in SOURCES, part
+
+
+def test_every_state_is_explained() -> None:
+    rows = re.findall(r"^\| `([a-z-]+)` \|[^|]+\|[^|]+\|$", README, re.MULTILINE)
+    assert sorted(rows) == sorted(state.value for state in State)
 
 
 def test_every_reason_is_explained() -> None:
