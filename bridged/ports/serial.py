@@ -266,6 +266,8 @@ def _is_tty_name(port: str) -> bool:
 def _explain_missing(path: Path) -> str:
     if path.is_symlink():
         return f"a link to {path.readlink()}, which does not exist: is the adapter unplugged?"
+    if path.is_relative_to("/tmp") and "NOTIFY_SOCKET" in os.environ:
+        return "does not exist: the service has a /tmp of its own (PrivateTmp=), use a path in /run"
     patterns = ("serial/by-id/*", "ttyUSB*", "ttyACM*")
     present = [str(device) for pattern in patterns for device in sorted(_DEV.glob(pattern))]
     return f"does not exist; serial adapters here: {', '.join(present) or 'none'}"

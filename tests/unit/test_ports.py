@@ -228,6 +228,14 @@ class TestTtyErrors:
         with pytest.raises(PortError, match=f"here: {names}$"):
             open_port(str(missing), 57600)
 
+    def test_a_service_has_its_own_tmp(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = "/tmp/is-nothing/can232"
+        with pytest.raises(PortError, match="does not exist; serial adapters here"):
+            open_port(path, 57600)
+        monkeypatch.setenv("NOTIFY_SOCKET", "/run/x")
+        with pytest.raises(PortError, match=r"does not exist: the service has a /tmp of its own"):
+            open_port(path, 57600)
+
     def test_link_to_nothing(self, tmp_path: Path) -> None:
         (tmp_path / "link").symlink_to("/dev/pts/nothing")
         with pytest.raises(PortError, match="a link to /dev/pts/nothing, which does not exist"):
