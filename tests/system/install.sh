@@ -10,6 +10,7 @@ cp -r "$top/pyproject.toml" "$top/README.md" "$top/LICENSE" "$top/bridged" "$top
 rm -f bridged/*.so
 
 # The first block of commands; where they install to, and what apt does, is this machine's.
+# shellcheck disable=SC2016  # backquotes of Markdown
 sed -n '/^## Install/,/^## /p' README.md | sed -n '/^```sh/,/^```/p' | sed -n '2,/^```/p' | grep -v '^```' | grep -v '^apt ' |
     sed -e "s|/opt/can-bridge|$work/venv|g" -e "s|/usr/local/bin|$work/bin|g" -e 's|^python3 |/usr/bin/python3 |' \
         -e 's|pip install|pip install -q --disable-pip-version-check|' > "$work/install"
