@@ -14,8 +14,7 @@ from bridged.kept_port import TRIES, KeptPort
 from bridged.simulators.sja1000 import Frame
 
 FRAMES = [Frame(0x123, False, False, 8, bytes([0xA0 + n] * 8)) for n in range(3)]
-STREAM = 3 * 14  # bytes of the frames; then comes the question
-CUTS = range(1, STREAM)
+CUTS = range(14, 29)  # at each byte of the second frame, which has 14
 
 
 class Port:
