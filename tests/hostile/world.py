@@ -304,6 +304,10 @@ class World:
         if len(self.failures) < 20:
             self.failures.append(f"{type(self.kind).__name__}: {text}")
 
+    def close(self) -> None:
+        self._steps.close()  # type: ignore[attr-defined]
+        self.hang_up()
+
     def begin(self, kind: type[Good]) -> None:
         self._steps.close()  # type: ignore[attr-defined]
         if not self.reading or self._holding:
@@ -371,7 +375,7 @@ class Run:
             folder = Path(name)
             self.deadline = self.draw.choice((0.05, 0.2, 0.5, 1.0))
             self.world = World(self.adapter, self.seed, folder, self.deadline)
-            stack.callback(self.world.hang_up)
+            stack.callback(self.world.close)
             near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             stack.enter_context(far)
             self.station = Station(far, random.Random(f"{self.seed} station"))
