@@ -114,16 +114,6 @@ def test_both_ways_at_once_and_with_a_window_of_two(rig: Rig) -> None:
     bridge.stop_cleanly()
 
 
-def test_slcanpty_is_recognised(rig: Rig) -> None:
-    near, far = rig.vcan(), rig.vcan()
-    _, port = rig.slcanpty(far)
-    bridge = rig.bridge(configuration(port, near))
-    reason = bridge.wait_state("fault")["reason"]
-    assert "answers V with 'V1013' and N with 'N4242': probably slcanpty, not a CAN232" in reason
-    bridge.stop_cleanly()
-
-
-@pytest.mark.parametrize("count", FRAMES)
 def test_slcanpty_as_the_adapter(rig: Rig, count: int) -> None:
     near, far = rig.vcan(), rig.vcan()
     _, port = rig.slcanpty(far)
