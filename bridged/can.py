@@ -1,7 +1,16 @@
-"""CAN terms as values: bit timing and acceptance filter of an SJA1000, the controller in these adapters."""
+"""CAN terms as values: bit timing and acceptance filter of an SJA1000, the controller in these adapters; the
+state of a controller; CAN error frames.
+
+A change of state becomes a CAN error frame as the kernel's drivers make them (linux/can/error.h and
+can_change_state in drivers/net/can/dev): error counters in data[6] and data[7], and the direction that the
+state comes from, if the counters are known. Without CAN_ERR_CNT, which says that there are counters: it is
+as new as Linux 6.0, and can-utils of before (Debian 12's) refuse to decode a frame that has it.
+"""
 
 from __future__ import annotations
 
+import enum
+import struct
 from typing import NamedTuple
 
 CAN232_STANDARD_BITRATES = {
@@ -150,3 +159,43 @@ def bit_timing(bitrate: int, sample_point: float | None = None, clock_hz: int = 
             f"nearest is {best.sample_point / 100:.3g}; or give btr0 and btr1"
         )
     return best.btr0, best.btr1
+
+
+# --- The state of a controller, and error frames ---------------------------------------------------
+
+WARNING_LIMIT = 96
+PASSIVE_LIMIT = 128
+
+CAN_ERR_FLAG = 0x20000000
+CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x002, 0x004, 0x008
+CAN_ERR_BUSOFF, CAN_ERR_BUSERROR, CAN_ERR_RESTARTED = 0x040, 0x080, 0x100
+CRTL_RX_OVERFLOW, CRTL_ACTIVE = 0x01, 0x40
+CRTL_RX_WARNING, CRTL_TX_WARNING, CRTL_RX_PASSIVE, CRTL_TX_PASSIVE = 0x04, 0x08, 0x10, 0x20
+
+FRAME = struct.Struct("=IB3x8s")  # struct can_frame
+
+
+class BusState(enum.IntEnum):
+    """Of a CAN controller (ISO 11898-1); ordered."""
+
+    ERROR_ACTIVE = 0
+    ERROR_WARNING = 1
+    ERROR_PASSIVE = 2
+    BUS_OFF = 3
+
+    @property
+    def text(self) -> str:
+        return self.name.lower().replace("_", "-")
+
+
+def state_of(tec: int, rec: int) -> BusState:
+    """The state that these error counters mean; bus-off cannot be told by them."""
+    worst = max(tec, rec)
+    if worst >= PASSIVE_LIMIT:
+        return BusState.ERROR_PASSIVE
+    return BusState.ERROR_WARNING if worst >= WARNING_LIMIT else BusState.ERROR_ACTIVE
+
+
+def error_frame(classes: int, *, crtl: int = 0, tec: int = 0, rec: int = 0) -> bytes:
+    """A `struct can_frame` of these error classes (linux/can/error.h)."""
+    return FRAME.pack(CAN_ERR_FLAG | classes, 8, bytes((0, crtl, 0, 0, 0, 0, tec, rec)))

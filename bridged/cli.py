@@ -79,12 +79,12 @@ def _run(args: argparse.Namespace) -> int:
     gc.disable()  # until all is loaded, which makes no garbage to look for: 5 % of the time to the start
     _import_msgspec()
 
-    from bridged.bridge import Bridge  # noqa: PLC0415
-    from bridged.journal import start_logging  # noqa: PLC0415
-    from bridged.memory import FileMemory, state_directory  # noqa: PLC0415
-    from bridged.notify import systemd_notifier  # noqa: PLC0415
-    from bridged.service import Service, hangup_means_reload  # noqa: PLC0415
-    from bridged.status import StatusServer, farewell, own_socket_path  # noqa: PLC0415
+    from bridged.bridge.bridge import Bridge  # noqa: PLC0415
+    from bridged.daemon.eeprom_store import FileMemory, state_directory  # noqa: PLC0415
+    from bridged.daemon.journal import start_logging  # noqa: PLC0415
+    from bridged.daemon.notify import systemd_notifier  # noqa: PLC0415
+    from bridged.daemon.service import Service, hangup_means_reload  # noqa: PLC0415
+    from bridged.daemon.status import StatusServer, farewell, own_socket_path  # noqa: PLC0415
 
     config = _load(args.config)
     notifier = systemd_notifier()
@@ -155,7 +155,7 @@ def _check_one(path: Path) -> None:
 
 def _status_paths(args: argparse.Namespace) -> list[Path]:
     """The status sockets to ask; NotRunningError: there is none."""
-    from bridged.status import NotRunningError, running_sockets  # noqa: PLC0415
+    from bridged.daemon.status import NotRunningError, running_sockets  # noqa: PLC0415
 
     if args.socket:
         return [Path(args.socket)]
@@ -190,7 +190,7 @@ def _ask(args: argparse.Namespace) -> tuple[str, bool]:
     """What to show, and whether all bridges that were asked run."""
     import json  # noqa: PLC0415
 
-    from bridged.status import NotRunningError, StatusError, is_running, query, render, render_short  # noqa: PLC0415
+    from bridged.daemon.status import NotRunningError, StatusError, is_running, query, render, render_short  # noqa: PLC0415
 
     paths = _status_paths(args)
     if len(paths) == 1:
@@ -227,7 +227,7 @@ def _status(args: argparse.Namespace) -> int:
 
 def _watch(args: argparse.Namespace) -> int:
     """Until Ctrl-C; a bridge that is not there, or does not answer, is waited for."""
-    from bridged.status import NoAnswerError  # noqa: PLC0415
+    from bridged.daemon.status import NoAnswerError  # noqa: PLC0415
 
     screen = not args.json and sys.stdout.isatty()
     missed = ""
@@ -331,7 +331,7 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
         "simulate", "Simulate an adapter on a pseudo terminal, or on an existing device or socket.", _simulate
     )
     if command == "simulate":
-        from bridged.simulators import commands as simulators  # noqa: PLC0415
+        from bridged.simulators import cli as simulators  # noqa: PLC0415
 
         kinds = simulate.add_subparsers(dest="kind", required=True, metavar="ADAPTER")
         for adapter, text in simulators.ADAPTERS.items():
@@ -346,7 +346,7 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from bridged.simulators import commands  # noqa: PLC0415
+    from bridged.simulators import cli as commands  # noqa: PLC0415
 
     return commands.run(args)
 

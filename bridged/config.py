@@ -10,7 +10,8 @@ from msgspec import Meta, Struct
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bridged import can
-from bridged.port_names import USB_DEVICE, is_numbered_terminal, port_problem
+from bridged.ports.names import USB_DEVICE, is_numbered_terminal, port_problem
+from bridged.text import quoted
 from bridged.yaml_source import (
     Problems,
     Section,
@@ -18,7 +19,6 @@ from bridged.yaml_source import (
     is_empty,
     key_names,
     parse,
-    quoted,
     read_text,
     scalar_value,
 )
@@ -273,7 +273,7 @@ def check(path: str | os.PathLike[str]) -> tuple[Config, list[str]]:
 
 
 def _check_python_can(section: Section, bus: BusConfig) -> None:
-    from bridged.buses import backends  # noqa: PLC0415 - python-can costs 85 ms and 19 MB
+    from bridged.interfaces import backends  # noqa: PLC0415 - python-can costs 85 ms and 19 MB
 
     if text := backends.interface_problem(bus.interface):
         section.refuse_value("interface", text)

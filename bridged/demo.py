@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING, Any
 
 import can
 
-from bridged.bridge import Bridge
-from bridged.buses.socketcan import NO_CAN, open_socketcan
+from bridged.bridge.bridge import Bridge
 from bridged.config import load
-from bridged.errors import BusError
-from bridged.memory import FileMemory
-from bridged.service import serve
+from bridged.daemon.eeprom_store import FileMemory
+from bridged.daemon.service import serve
+from bridged.errors import NO_CAN, BusError
+from bridged.interfaces.socketcan import open_socketcan
 from bridged.simulators.can232 import Can232
-from bridged.simulators.commands import ADAPTERS, STOP_GRACE_S, positive
+from bridged.simulators.cli import ADAPTERS, STOP_GRACE_S, positive
 from bridged.simulators.serve import Simulator, cyclic_frames
 from bridged.simulators.uart import Uart
 

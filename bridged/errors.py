@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 
 class BridgeError(Exception):
     """Base of all errors that this package raises on purpose; the text says what to do."""
@@ -29,3 +31,9 @@ class WrongDeviceError(AdapterError):
 
 class BusError(BridgeError):
     """The CAN interface on the host's side could not be opened, made or used."""
+
+
+NO_CAN: Final = "this kernel has no SocketCAN"
+GET_CAN: Final = (
+    "try `modprobe can_raw`, install a kernel that has it (Debian: linux-image-amd64, not -cloud-amd64)"
+)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import pwd
 
 
 def printable(text: str) -> str:
@@ -16,3 +17,20 @@ def printable(text: str) -> str:
     with contextlib.suppress(UnicodeEncodeError):  # a surrogate that stands for no byte: escaped below
         text = text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def quoted(text: str) -> str:
+    """Quote a text of the file for a message: one line, nothing unprintable, not too long."""
+    return repr(cut(text))
+
+
+def cut(text: str) -> str:
+    """Not more of a text than fits into a message."""
+    return text if len(text) <= 40 else f"{text[:40]}…"
+
+
+def user_name(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"user {uid}"

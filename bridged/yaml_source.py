@@ -18,6 +18,7 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from yaml.reader import ReaderError
 
 from bridged.errors import ConfigError
+from bridged.text import cut, quoted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -92,7 +93,7 @@ def read_text(path: Path, problems: Problems) -> str:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        from bridged.status import user_name  # noqa: PLC0415 - only for a file that cannot be read
+        from bridged.text import user_name  # noqa: PLC0415 - only for a file that cannot be read
 
         by = f" (by user {user_name(os.geteuid())})" if isinstance(error, PermissionError) else ""
         raise ConfigError([f"{path}: cannot be read: {error.strerror or error}{by}"]) from error
@@ -182,7 +183,7 @@ def describe(node: Node, *, number_wanted: bool = False) -> str:
     if isinstance(value, bool):
         return f"the yes-or-no value {quoted(node.value)}"
     if isinstance(value, int | float):
-        return _cut(node.value)
+        return cut(node.value)
     text = f"the text {quoted(node.value)}"
     number = _as_number(node.value) if number_wanted else None
     if number is None:
@@ -190,15 +191,6 @@ def describe(node: Node, *, number_wanted: bool = False) -> str:
     if node.style is not None:
         return f"{text} (write {number}, without quotes)"
     return f"{text} (write {number})"
-
-
-def quoted(text: str) -> str:
-    """Quote a text of the file for a message: one line, nothing unprintable, not too long."""
-    return repr(_cut(text))
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= 40 else f"{text[:40]}…"
 
 
 def _as_number(text: str) -> str | None:

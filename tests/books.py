@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from bridged.status import LOST_BEFORE_READ
+from bridged.interfaces.base import LOST_BEFORE_READ
 
 
 def check_books(counters: Mapping[str, Any], queued: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Generator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:
-    from bridged.health import Observation
+    from bridged.can import BusState
 
 
 class Reply(enum.Enum):
@@ -67,6 +67,32 @@ class Identity(NamedTuple):
 
     version: str | None = None
     serial_number: str | None = None
+
+
+class Happened(enum.Flag):
+    """What can have happened since the last look."""
+
+    NOTHING = 0
+    TX_FULL = enum.auto()
+    RX_OVERFLOW = enum.auto()
+    ARBITRATION_LOST = enum.auto()
+    BUS_ERROR = enum.auto()
+    RESTARTED = enum.auto()
+
+
+class Observation(NamedTuple):
+    """What an adapter said of its bus. `state` None: it did not say; counters None: it cannot."""
+
+    description: str
+    state: BusState | None = None
+    lasting: bool = True  # False: `state` is the worst there was since the last look, not what is now
+    tec: int | None = None
+    rec: int | None = None
+    happened: Happened = Happened.NOTHING
+
+
+UNKNOWN = Observation("unknown")
+"""It did not answer."""
 
 
 class Memory(Protocol):

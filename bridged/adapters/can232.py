@@ -8,18 +8,21 @@ import re
 from typing import TYPE_CHECKING
 
 from bridged.adapters.base import (
+    UNKNOWN,
     Answer,
     Exchange,
     Flow,
+    Happened,
     Identity,
     Memory,
+    Observation,
     Polling,
     Reply,
     Steps,
     pause,
 )
+from bridged.can import BusState
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.health import UNKNOWN, BusState, Happened, Observation
 from bridged.text import printable
 
 if TYPE_CHECKING:

@@ -6,9 +6,21 @@ import logging
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from bridged.adapters.base import Answer, Exchange, Flow, Identity, Polling, Reply, Steps, pause
+from bridged.adapters.base import (
+    UNKNOWN,
+    Answer,
+    Exchange,
+    Flow,
+    Happened,
+    Identity,
+    Observation,
+    Polling,
+    Reply,
+    Steps,
+    pause,
+)
+from bridged.can import BusState, state_of
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.health import UNKNOWN, BusState, Happened, Observation, state_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence

@@ -22,7 +22,7 @@ import serial
 
 from bridged.errors import BridgeError, PortError
 from bridged.ports import sysfs
-from bridged.pump import POLL_INTERVAL_S, Pump
+from bridged.ports.pump import POLL_INTERVAL_S, Pump
 
 _log = logging.getLogger(__name__)
 

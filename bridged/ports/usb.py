@@ -22,7 +22,7 @@ from usb.core import USBError, USBTimeoutError
 
 from bridged.errors import PortError
 from bridged.ports import sysfs
-from bridged.pump import POLL_INTERVAL_S, Pump
+from bridged.ports.pump import POLL_INTERVAL_S, Pump
 from bridged.text import printable
 
 if TYPE_CHECKING:

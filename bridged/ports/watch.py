@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from bridged.errors import PortError
-from bridged.port_names import is_numbered_terminal
 from bridged.ports import sysfs
+from bridged.ports.names import is_numbered_terminal
 
 _SYS: Final = Path("/sys")
 _DEV: Final = Path("/dev")

@@ -18,8 +18,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridged.buses.socketcan import GET_CAN, NO_CAN
-from bridged.errors import BusError, PortError
+from bridged.errors import GET_CAN, NO_CAN, BusError, PortError
 from bridged.simulators.sja1000 import Frame
 
 if TYPE_CHECKING:

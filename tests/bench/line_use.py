@@ -18,10 +18,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from bridged import bridge as bridge_module
-from bridged.bridge import Bridge
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.bridge import Bridge
 from bridged.config import load
-from bridged.memory import FileMemory
+from bridged.daemon.eeprom_store import FileMemory
 from bridged.simulators.can232 import Can232
 from bridged.simulators.serve import Simulator
 from bridged.simulators.uart import Uart

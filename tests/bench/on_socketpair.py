@@ -3,8 +3,8 @@
 import socket
 import sys
 
-from bridged.buses import socketcan
 from bridged.cli import main
+from bridged.interfaces import socketcan
 
 
 class SocketpairBus:

@@ -45,7 +45,7 @@ ANSWERS = {b"V": b"V1013\r", b"N": b"NSTRT\r", b"F": b"F00\r", b"A": b"\a", b"t"
 # The bus of a kernel without CAN: everything else is as in `can-bridge run`.
 SOCKETPAIR_RUN = """
 import socket, sys
-from bridged.buses import socketcan
+from bridged.interfaces import socketcan
 from bridged.cli import main
 near = int(sys.argv.pop())
 class Bus:

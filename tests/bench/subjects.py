@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bridged.status import StatusError, query
+from bridged.daemon.status import StatusError, query
 
 HERE = Path(__file__).resolve().parent
 SUBJECT_CPU, LOAD_CPU = 0, (os.cpu_count() or 1) - 1

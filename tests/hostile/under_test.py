@@ -21,12 +21,12 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from bridged import bridge as bridge_module
-from bridged.bridge import Bridge
-from bridged.buses.socketcan import receive_stamped
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import State
 from bridged.config import load
-from bridged.lifecycle import State
-from bridged.memory import FileMemory
+from bridged.daemon.eeprom_store import FileMemory
+from bridged.interfaces.socketcan import receive_stamped
 
 LOOK_S = 0.02
 STOP_LIMIT_S = 5.0

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 import pytest
 import yaml
 
-from bridged.status import StatusError, query
+from bridged.daemon.status import StatusError, query
 
 # An emulated machine is some twenty times slower than a real one: deadlines are for what will never come.
 DEADLINE_S = 60.0

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridged.buses import open_bus
 from bridged.errors import BusError
+from bridged.interfaces import open_bus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bridged.buses import Bus
+    from bridged.interfaces.base import Bus
 
 LIMIT_S = 5.0
 NAME = "bridgetest0"

@@ -16,7 +16,7 @@ from wired import UART_RATE, in_order, wait_flowing
 
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom
-from bridged.simulators.commands import STOP_GRACE_S
+from bridged.simulators.cli import STOP_GRACE_S
 from bridged.simulators.faults import Fault
 from bridged.simulators.serve import Simulator, mixed_frames, record_line
 from bridged.simulators.uart import Uart

@@ -22,7 +22,7 @@ from rig import Bridge, Resources, wait_until
 from bridged.simulators import faults
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Counters, Eeprom
-from bridged.simulators.commands import STOP_GRACE_S
+from bridged.simulators.cli import STOP_GRACE_S
 from bridged.simulators.faults import BURST_S, Fault
 from bridged.simulators.serve import TRAFFIC_LATE_S, record_line
 from bridged.simulators.sja1000 import Frame

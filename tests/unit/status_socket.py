@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from bridged.status import StatusServer
+from bridged.daemon.status import StatusServer
 
 
 def snapshot(name: str = "can232", **changes: Any) -> dict[str, Any]:

@@ -17,11 +17,10 @@ from usb2can_host import (
 from usb2can_words import LOOPBACK, OPEN, SETUP, WRITTEN, ask, opened
 
 from bridged import _relay
-from bridged.adapters.base import Answer, Reply
+from bridged.adapters.base import Answer, Happened, Observation, Reply
 from bridged.adapters.usb2can import BUS_OFF, ERROR, GET_MODE, Usb2can
-from bridged.can import AcceptanceFilter, BitTiming, bit_timing
+from bridged.can import AcceptanceFilter, BitTiming, BusState, bit_timing
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.health import BusState, Happened, Observation
 from bridged.simulators.sja1000 import MOD, Frame
 from bridged.simulators.usb2can import Usb2can as Device
 

@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 from books import check_books
 
-from bridged import bridge as bridge_module
-from bridged.bridge import Bridge
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import Event, State
 from bridged.config import load
-from bridged.lifecycle import Event, State
-from bridged.memory import FileMemory
-from bridged.service import serve
+from bridged.daemon.eeprom_store import FileMemory
+from bridged.daemon.service import serve
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232 import State as Channel
 from bridged.simulators.serve import Fault, Simulator
@@ -309,7 +309,9 @@ def test_plugged_in_late_and_told_at_once(bench: Bench, caplog: pytest.LogCaptur
         run_until(bridge, lambda: bridge.state is State.RUNNING)
         stopped(bridge)
     lines = [
-        record.getMessage().partition(":")[0] for record in caplog.records if record.name == "bridged.bridge"
+        record.getMessage().partition(":")[0]
+        for record in caplog.records
+        if record.name == "bridged.bridge.bridge"
     ]
     assert [line for line in lines if "state=" in line] == [
         "state=opening",

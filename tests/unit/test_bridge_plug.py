@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from test_bridge import Bench, run_until, started, stopped
 
-from bridged import bridge as bridge_module
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.lifecycle import State
 from bridged.errors import PortError
-from bridged.lifecycle import State
 from bridged.ports import Port, open_port
 from bridged.simulators.can232 import Can232
 

@@ -12,9 +12,9 @@ from books import check_books
 from test_bridge import FRAME, Bench, run_until, started, stopped
 from test_bridge_usb2can import Usb2canBench
 
-from bridged.bridge import Bridge
-from bridged.buses.socketcan import receive_stamped
-from bridged.lifecycle import State
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import State
+from bridged.interfaces.socketcan import receive_stamped
 from bridged.simulators.can232 import Can232
 
 INTERVAL_S = 0.01

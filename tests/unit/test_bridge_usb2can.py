@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 from test_bridge import LIMIT_S, Bench, PairBus, PairPort, run_until, started, stopped
 
-from bridged import bridge as bridge_module
-from bridged.bridge import Bridge
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import State
 from bridged.config import load
-from bridged.lifecycle import State
-from bridged.memory import FileMemory
+from bridged.daemon.eeprom_store import FileMemory
 from bridged.simulators.ends import pack, unpack
 from bridged.simulators.serve import Simulator, mixed_frames
 from bridged.simulators.sja1000 import Frame

@@ -24,9 +24,9 @@ from clone_parsers import (
 )
 from test_bridge import Bench, PairPort, bench, run_until, started, stopped  # noqa: F401 - a fixture
 
-from bridged import bridge as bridge_module
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.lifecycle import State
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.lifecycle import State
 from bridged.simulators.can232 import Can232
 
 HARMLESS = {b"V\r", b"N\r", b"v\r", b"F\r", b"C\r", b"V" * 50}

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from bridged import cli
-from bridged.buses import backends, open_bus
 from bridged.config import check
 from bridged.errors import BusError, ConfigError
+from bridged.interfaces import backends, open_bus
 
 GOOD = "adapter: {type: can232, port: /dev/ttyUSB0}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\n"
 

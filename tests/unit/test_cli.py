@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from status_socket import serving, snapshot
 
-from bridged import VERSION, cli, status
+from bridged import VERSION, cli
+from bridged.daemon import status
 
 CONFIG = """\
 adapter: {type: can232, port: /nowhere/tty, baudrate: 115200}

@@ -3,8 +3,8 @@
 import math
 
 from bridged.adapters.base import Reply, Steps, pause
-from bridged.exchanges import Exchanges
-from bridged.lifecycle import Event
+from bridged.bridge.exchanges import Exchanges
+from bridged.bridge.lifecycle import Event
 
 
 def paused() -> tuple[Exchanges, list[Event]]:

@@ -4,7 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridged.health import BusState, Happened, Health, Observation, Stall, error_frame, state_of
+from bridged.adapters.base import Happened, Observation
+from bridged.bridge.health import Health, Stall
+from bridged.can import BusState, error_frame, state_of
 
 ACTIVE, WARNING, PASSIVE, BUS_OFF = BusState
 CRTL, BUSOFF, RESTARTED = 0x004, 0x040, 0x100

@@ -8,9 +8,10 @@ from collections.abc import Callable
 import pytest
 from flow_rig import Rig, S, numbered, packed, rig_with
 
-from bridged import _relay, kept_port
+from bridged import _relay
+from bridged.bridge import kept_port
+from bridged.bridge.kept_port import TRIES, KeptPort
 from bridged.errors import AdapterError
-from bridged.kept_port import TRIES, KeptPort
 from bridged.simulators.sja1000 import Frame
 
 FRAMES = [Frame(0x123, False, False, 8, bytes([0xA0 + n] * 8)) for n in range(3)]

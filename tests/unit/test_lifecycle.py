@@ -9,21 +9,9 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bridged.lifecycle import (
-    CAUSES_MAX,
-    IGNORED,
-    JITTER,
-    REPEAT_LOG_S,
-    STABLE_S,
-    TABLE,
-    TOLD_AT_MOST,
-    Action,
-    Backoff,
-    Event,
-    State,
-    Told,
-    transition,
-)
+from bridged.bridge.backoff import JITTER, STABLE_S, Backoff
+from bridged.bridge.lifecycle import IGNORED, TABLE, Action, Event, State, transition
+from bridged.bridge.log_limiter import CAUSES_MAX, REPEAT_LOG_S, TOLD_AT_MOST, LogLimiter
 
 # Events that a state can meet, and no others: RELEASE drops what the relay still had to say, a timer is set
 # in four states only, and nobody looks out for the device before the start.
@@ -110,7 +98,7 @@ def test_only_a_stable_run_makes_pauses_short_again(ran_s: float, pause_s: float
 
 
 def test_a_cause_is_told_once_until_all_is_well_again() -> None:
-    told = Told()
+    told = LogLimiter()
     assert (told.failing, told.quiet) == (False, False)
     assert [told.tell("a", n) for n in range(3)] == [1, None, None]
     assert told.tell("b", 3) == 1
@@ -123,7 +111,7 @@ def test_a_cause_is_told_once_until_all_is_well_again() -> None:
 
 
 def test_what_comes_and_goes_is_not_told_each_time() -> None:
-    told = Told()
+    told = LogLimiter()
     times = []
     for n in range(20):
         times.append(told.tell("flaps", n))
@@ -134,14 +122,14 @@ def test_what_comes_and_goes_is_not_told_each_time() -> None:
 
 
 def test_what_lasts_is_told_again_and_how_often_it_came() -> None:
-    told = Told()
+    told = LogLimiter()
     times = [told.tell("silent", now) for now in range(0, 2 * int(REPEAT_LOG_S) + 1, 5)]
     per_time = int(REPEAT_LOG_S) // 5
     assert [n for n in times if n] == [1, per_time, per_time]
 
 
 def test_causes_are_not_told_apart_by_numbers_and_their_number_is_bounded() -> None:
-    told = Told()
+    told = LogLimiter()
     assert [told.tell(f"TEC {n}", 0) for n in range(3)] == [1, None, None]
     texts = [f"{a}{b}" for a in string.ascii_letters for b in string.ascii_letters]
     assert sum(told.tell(text, 1) is not None for text in texts) == CAUSES_MAX
@@ -151,7 +139,7 @@ def test_causes_are_not_told_apart_by_numbers_and_their_number_is_bounded() -> N
 
 
 def test_an_interval_between_two_lines_of_a_cause() -> None:
-    told = Told(interval_s=10.0)
+    told = LogLimiter(interval_s=10.0)
     times = []
     for now in (0, 5, 9, 10, 19, 20):
         times.append(told.tell("noise", now))

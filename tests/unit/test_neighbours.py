@@ -17,17 +17,17 @@ import can
 import pytest
 from test_bridge import LIMIT_S
 
-from bridged import neighbours
-from bridged.bridge import Bridge
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import State
 from bridged.config import load
-from bridged.lifecycle import State
-from bridged.memory import FileMemory
-from bridged.neighbours import Neighbours
+from bridged.daemon import neighbours
+from bridged.daemon.eeprom_store import FileMemory
+from bridged.daemon.neighbours import Neighbours
+from bridged.daemon.status import StatusServer
 from bridged.simulators.can232 import Can232
 from bridged.simulators.ends import pack
 from bridged.simulators.serve import Simulator
 from bridged.simulators.sja1000 import Frame
-from bridged.status import StatusServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

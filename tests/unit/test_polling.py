@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import pytest
 
-from bridged.adapters.base import Answer, Exchange, Reply
+from bridged.adapters.base import UNKNOWN, Answer, Exchange, Observation, Reply
+from bridged.bridge.polling import UNKNOWN_LIMIT, HealthPolling
+from bridged.can import BusState, error_frame, state_of
 from bridged.errors import AdapterError
-from bridged.health import UNKNOWN, BusState, Observation, error_frame, state_of
-from bridged.polling import UNKNOWN_LIMIT, HealthPolling
 
 
 class Adapter:

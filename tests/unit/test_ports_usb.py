@@ -184,7 +184,8 @@ class TestBytes:
                 written += os.write(port.fd, bytes(16))
             except BlockingIOError:
                 break
-        assert written < 4096  # frames shall wait in the relay, where they can be dropped when they are old
+        # A block of the pump and what the kernel holds: the others wait in the relay, which drops old ones.
+        assert written < 2 * 4096
         start = time.monotonic()
         port.close()
         assert time.monotonic() - start < 15.0  # it does not hang; how fast it is, is no matter for a test

@@ -13,7 +13,7 @@ import pytest
 
 from bridged.errors import PortError
 from bridged.ports import open_port
-from bridged.pump import Pump
+from bridged.ports.pump import Pump
 
 LIMIT_S = 30.0  # for what takes milliseconds
 
@@ -66,7 +66,7 @@ class TestPump:
     def test_close_gives_up_on_a_stuck_driver(
         self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
-        monkeypatch.setattr("bridged.pump.JOIN_LIMIT_S", 0.02)
+        monkeypatch.setattr("bridged.ports.pump.JOIN_LIMIT_S", 0.02)
         stuck = StuckPump()
         far = stuck._far.fileno()
         start = time.monotonic()

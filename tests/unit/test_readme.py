@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from bridged import _relay, cli, config
-from bridged.lifecycle import State
-from bridged.status import LOST_BEFORE_READ
+from bridged.bridge.lifecycle import State
+from bridged.interfaces.base import LOST_BEFORE_READ
 
 TOP = Path(__file__).parents[2]
 README = (TOP / "README.md").read_text()

@@ -18,16 +18,18 @@ from typing import Any
 
 import pytest
 
-from bridged import VERSION, bus_end, journal, notify, service
-from bridged import bridge as bridge_module
-from bridged.bridge import Bridge
-from bridged.buses.python_can import open_python_can
+from bridged import VERSION
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge import interface as bus_end
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import State
 from bridged.config import load
+from bridged.daemon import journal, notify, service
+from bridged.daemon.eeprom_store import FileMemory
+from bridged.daemon.notify import Notifier
+from bridged.daemon.service import Service
 from bridged.errors import BusError, ConfigError
-from bridged.lifecycle import State
-from bridged.memory import FileMemory
-from bridged.notify import Notifier
-from bridged.service import Service
+from bridged.interfaces.python_can import open_python_can
 
 DEADLINE_S = 20.0
 RUNNING = "running: USB2CAN HW0003FW0016 RIG0001 on /dev/ttyUSB0, vcan0"

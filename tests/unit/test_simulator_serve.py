@@ -17,7 +17,7 @@ from simulating import TIMEOUT_S, ask, by_hand, host, process, read, running, un
 from bridged.errors import BusError, PortError
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom
-from bridged.simulators.commands import load_eeprom
+from bridged.simulators.cli import load_eeprom
 from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
 from bridged.simulators.faults import Fault, parse_fault
 from bridged.simulators.serve import Simulator, mixed_frames

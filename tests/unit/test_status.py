@@ -11,8 +11,16 @@ from typing import Any
 import pytest
 from status_socket import listening, serving, snapshot
 
-from bridged import status
-from bridged.status import NoAnswerError, StatusError, StatusServer, farewell, own_socket_path, query, render
+from bridged.daemon import status
+from bridged.daemon.status import (
+    NoAnswerError,
+    StatusError,
+    StatusServer,
+    farewell,
+    own_socket_path,
+    query,
+    render,
+)
 
 GROUP = 12345
 

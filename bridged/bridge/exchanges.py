@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from bridged import _relay
 from bridged.adapters.base import Answer, Reply
+from bridged.bridge.lifecycle import Event
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.lifecycle import Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable

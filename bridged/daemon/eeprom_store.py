@@ -12,7 +12,8 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridged.status import OTHERS_WRITE, runtime_directory, user_name
+from bridged.daemon.status import OTHERS_WRITE, runtime_directory
+from bridged.text import user_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

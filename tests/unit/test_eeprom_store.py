@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bridged import memory
-from bridged.memory import FileMemory
+from bridged.daemon import eeprom_store as memory
+from bridged.daemon.eeprom_store import FileMemory
 
 SERIAL = "A123"
 

@@ -9,10 +9,11 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from bridged.adapters.base import Reply
+from bridged.adapters.base import UNKNOWN, Happened, Observation, Reply
+from bridged.bridge.health import Health, Stall
+from bridged.bridge.log_limiter import LogLimiter, repeated
+from bridged.can import BusState
 from bridged.errors import AdapterError
-from bridged.health import UNKNOWN, BusState, Happened, Health, Observation, Stall
-from bridged.lifecycle import Told, repeated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,8 +75,8 @@ class HealthPolling:
         self.full_at = -math.inf  # when it said last that its transmit buffer was full
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
-        self._warned = Told(LOG_INTERVAL_S)
-        self._told = Told()  # of bus states
+        self._warned = LogLimiter(LOG_INTERVAL_S)
+        self._told = LogLimiter()  # of bus states
 
     def start(self, now: float, *, restarted: bool = False) -> None:
         """The adapter runs; `restarted`: after bus-off."""

@@ -11,18 +11,18 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+from bridged.bridge.lifecycle import State
+from bridged.daemon.notify import Notifier
 from bridged.errors import ConfigError
-from bridged.lifecycle import State
-from bridged.notify import Notifier
 
 if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
-    from bridged.bridge import Bridge
+    from bridged.bridge.bridge import Bridge
     from bridged.config import Config
-    from bridged.neighbours import Neighbours
-    from bridged.status import StatusServer
+    from bridged.daemon.neighbours import Neighbours
+    from bridged.daemon.status import StatusServer
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +146,7 @@ class Service:
         if self._neighbours is None:
             if self.bridge.state is not State.RUNNING:
                 return
-            from bridged.neighbours import Neighbours  # noqa: PLC0415 - never at the cost of the start
+            from bridged.daemon.neighbours import Neighbours  # noqa: PLC0415 - never at the cost of the start
 
             self._neighbours = Neighbours(self._own_socket)
         self._neighbours.look(self.bridge, now)

@@ -10,7 +10,7 @@ import socket
 import struct
 from typing import Final
 
-from bridged.errors import BridgeError, BusError
+from bridged.errors import GET_CAN, NO_CAN, BridgeError, BusError
 
 # Not in Python's socket module: asm-generic/socket.h, linux/sockios.h, net/if.h, net/if_arp.h, linux/can/*.h
 _SO_SNDBUFFORCE: Final = 32
@@ -27,11 +27,6 @@ _CAN_ERR_MASK: Final = 0x1FFFFFFF
 
 _SK_MEMINFO_DROPS: Final = 8  # linux/sock_diag.h
 _OVERFLOW: Final = "socket-overflow"  # bus -> device: the relay did not come to read in time
-
-NO_CAN: Final = "this kernel has no SocketCAN"
-GET_CAN: Final = (
-    "try `modprobe can_raw`, install a kernel that has it (Debian: linux-image-amd64, not -cloud-amd64)"
-)
 
 _IFREQ: Final = struct.Struct("=16sH22x")  # name, then flags or the family of the hardware address
 _NAME_MAX: Final = 15

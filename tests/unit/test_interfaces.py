@@ -19,14 +19,15 @@ import can
 import pytest
 from can.interfaces import udp_multicast, virtual
 
-from bridged.buses import LOST_ERROR_FRAMES, open_bus, python_can, socketcan
-from bridged.buses.python_can import PythonCanBus, pack_message, unpack_frame
 from bridged.errors import BusError
+from bridged.interfaces import open_bus, python_can, socketcan
+from bridged.interfaces.base import LOST_ERROR_FRAMES
+from bridged.interfaces.python_can import PythonCanBus, pack_message, unpack_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bridged.buses import Bus
+    from bridged.interfaces.base import Bus
 
 LIMIT_S = 30.0  # for what takes milliseconds
 EFF, RTR, ERR = 0x80000000, 0x40000000, 0x20000000

@@ -19,24 +19,26 @@ from msgspec.structs import replace
 from bridged import _relay
 from bridged.adapters import make_adapter
 from bridged.adapters.base import Reply
-from bridged.bus_end import BusEnd
-from bridged.bus_off import BusOff, stuck_s
-from bridged.buses import open_bus
+from bridged.bridge.backoff import Backoff, chance
+from bridged.bridge.exchanges import REPLIES, Exchanges
+from bridged.bridge.interface import BusEnd
+from bridged.bridge.kept_port import KeptPort
+from bridged.bridge.lifecycle import Action, Event, State, transition
+from bridged.bridge.log_limiter import LogLimiter, repeated
+from bridged.bridge.polling import NOISE, NOISE_CAUSES, HealthPolling
+from bridged.bridge.recovery import BusOff, stuck_s
+from bridged.can import BusState
 from bridged.errors import PortError
-from bridged.exchanges import REPLIES, Exchanges
-from bridged.health import BusState
-from bridged.kept_port import KeptPort
-from bridged.lifecycle import Action, Backoff, Event, State, Told, chance, repeated, transition
-from bridged.polling import NOISE, NOISE_CAUSES, HealthPolling
+from bridged.interfaces import open_bus
+from bridged.interfaces.base import LOST_BEFORE_READ
 from bridged.ports import open_port
 from bridged.ports.sharing import Sharing
 from bridged.ports.watch import Watch
-from bridged.status import LOST_BEFORE_READ
 
 if TYPE_CHECKING:
     from bridged.adapters.base import Memory
-    from bridged.buses import Bus
     from bridged.config import Config
+    from bridged.interfaces.base import Bus
     from bridged.ports import Port
 
 log = logging.getLogger(__name__)
@@ -84,7 +86,7 @@ class Bridge:
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
         self.circle = ""  # what neighbours.py has found
-        self._told = Told()
+        self._told = LogLimiter()
         self.finished = False
         # Whether the adapter's channel may be open, as far as its answers tell; None: it was never asked.
         self.channel_open: bool | None = None
@@ -106,7 +108,7 @@ class Bridge:
         self._starts = 0  # how often it began to run
         self._identity: object = None  # that was told
         self._bus_off = BusOff(config, self.adapter, self._dispatch)
-        self._unanswered_told = Told(UNANSWERED_LOG_S)
+        self._unanswered_told = LogLimiter(UNANSWERED_LOG_S)
         self._counted_before: dict[str, Any] = {}  # by the bridges of this process before this one
         self._holds_bus = False  # its frames wait until the adapter runs, or fails to
         self._stop_by: float | None = None  # told to stop once what was read is sent, or then

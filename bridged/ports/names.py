@@ -3,7 +3,7 @@
 import os
 import re
 
-from bridged.yaml_source import quoted
+from bridged.text import quoted
 
 _SCHEMES = {"can232": ("socket", "rfc2217"), "usb2can": ("socket", "usb")}
 _SCHEMES_OF_OTHERS = {

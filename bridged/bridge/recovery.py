@@ -6,14 +6,16 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from bridged.lifecycle import Backoff, Event, Told, chance, repeated
+from bridged.bridge.backoff import Backoff, chance
+from bridged.bridge.lifecycle import Event
+from bridged.bridge.log_limiter import LogLimiter, repeated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bridged.adapters.base import Adapter
+    from bridged.bridge.polling import HealthPolling
     from bridged.config import Config
-    from bridged.polling import HealthPolling
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +51,7 @@ class BusOff:
         self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, chance)
         self._refusing_until = 0.0
         self._discarded = 0  # of the adapter's, those told
-        self._told = Told()
+        self._told = LogLimiter()
 
     @property
     def sets_pause(self) -> bool:

@@ -21,7 +21,6 @@ import contextlib
 import errno
 import grp
 import os
-import pwd
 import socket
 import stat
 import time
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bridged.errors import BridgeError
-from bridged.text import printable
+from bridged.text import printable, user_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,8 +39,6 @@ SYSTEM_DIRECTORY = Path("/run/can-bridge")
 FALLBACK_DIRECTORY = "/tmp/can-bridge-{uid}"  # without XDG_RUNTIME_DIR: su, cron, containers
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 GROUP = "can-bridge"  # systemd/can-bridge.sysusers
-# Reasons in tx_dropped for frames that were lost before the relay could read them.
-LOST_BEFORE_READ = ("socket-overflow", "bus-pump-overflow", "bus-recv-failed")
 
 
 class StatusError(BridgeError):
@@ -268,13 +265,6 @@ def _who_may(path: Path) -> str:
     if path.parent == SYSTEM_DIRECTORY:
         advice += f"; to do without, install systemd/can-bridge.sysusers and join group {GROUP}"
     return f"it is the bridge of {user_name(found.st_uid)}: {advice}"
-
-
-def user_name(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return f"user {uid}"
 
 
 def is_running(status: dict[str, Any]) -> bool:

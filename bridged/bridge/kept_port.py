@@ -17,7 +17,7 @@ import termios
 import time
 from typing import TYPE_CHECKING, Final
 
-from bridged.lifecycle import Told, repeated
+from bridged.bridge.log_limiter import LogLimiter, repeated
 
 if TYPE_CHECKING:
     from bridged import _relay
@@ -42,7 +42,7 @@ class KeptPort:
         self._message, self._taken = b"", 0  # what the port took a part of
         self._unread = False  # frames, since the adapter ran last
         self._tries = 0
-        self._told = Told()
+        self._told = LogLimiter()
 
     def release(self, port: Port) -> None:
         """After the relay's detach_port()."""

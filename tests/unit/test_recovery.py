@@ -12,19 +12,12 @@ import pytest
 from test_bridge import FRAME, Bench, run_until, started, stopped
 from test_bridge_usb2can import Usb2canBench
 
-from bridged import bridge as bridge_module
 from bridged.adapters.base import Steps
-from bridged.bridge import Bridge
-from bridged.buses.python_can import PythonCanBus
-from bridged.health import (
-    CAN_ERR_BUSOFF,
-    CAN_ERR_CRTL,
-    CAN_ERR_RESTARTED,
-    CRTL_ACTIVE,
-    BusState,
-    error_frame,
-)
-from bridged.lifecycle import Event, State
+from bridged.bridge import bridge as bridge_module
+from bridged.bridge.bridge import Bridge
+from bridged.bridge.lifecycle import Event, State
+from bridged.can import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_RESTARTED, CRTL_ACTIVE, BusState, error_frame
+from bridged.interfaces.python_can import PythonCanBus
 from bridged.simulators.can232 import Can232
 
 OLD, NEW = 0x100, 0x1FFFFFFF

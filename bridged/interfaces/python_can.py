@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import can
 
-from bridged.buses import LOST_ERROR_FRAMES
-from bridged.buses.backends import missing_package
-from bridged.buses.socketcan import receive_stamped, set_buffers
 from bridged.errors import BusError
-from bridged.pump import POLL_INTERVAL_S, Pump
+from bridged.interfaces.backends import missing_package
+from bridged.interfaces.base import LOST_ERROR_FRAMES
+from bridged.interfaces.socketcan import receive_stamped, set_buffers
+from bridged.ports.pump import POLL_INTERVAL_S, Pump
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

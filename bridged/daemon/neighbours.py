@@ -14,14 +14,15 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from bridged.lifecycle import State, Told, repeated
-from bridged.status import StatusError, query
+from bridged.bridge.lifecycle import State
+from bridged.bridge.log_limiter import LogLimiter, repeated
+from bridged.daemon.status import StatusError, query
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from bridged.bridge import Bridge
+    from bridged.bridge.bridge import Bridge
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ class Neighbours:
         self._search_at = self._look_at = 0.0
         self._equal_looks = 0
         self._thread: threading.Thread | None = None
-        self._told = Told()
+        self._told = LogLimiter()
 
     def look(self, bridge: Bridge, now: float) -> None:
         """Starts to search, or to compare frames, if it is time."""

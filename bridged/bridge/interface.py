@@ -10,21 +10,22 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from bridged.buses import LOST_ERROR_FRAMES
+from bridged.bridge.log_limiter import LogLimiter, repeated
+from bridged.can import CAN_ERR_BUSOFF, CRTL_RX_OVERFLOW, FRAME
 from bridged.errors import BusError
-from bridged.health import ErrorFrameLimit
-from bridged.lifecycle import Told, repeated
+from bridged.interfaces.base import LOST_ERROR_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bridged import _relay
-    from bridged.buses import Bus
     from bridged.config import Config
+    from bridged.interfaces.base import Bus
 
 log = logging.getLogger(__name__)
 
 RETRY_S = 1.0
+ERROR_FRAME_INTERVAL_S = 0.01
 
 
 class BusEnd:
@@ -42,7 +43,7 @@ class BusEnd:
         self._config = config
         self._relay = relay
         self._open_bus = open_bus
-        self._told = Told()
+        self._told = LogLimiter()
         self._dropped_before: Counter[str] = Counter()  # on buses that were closed since
 
     def open(self) -> None:
@@ -166,7 +167,7 @@ class BusEnd:
         self.bus = None
 
     def _look(self) -> None:
-        from bridged.buses.socketcan import is_up  # noqa: PLC0415 - no other interface is ever down
+        from bridged.interfaces.socketcan import is_up  # noqa: PLC0415 - no other interface is ever down
 
         channel = self._config.bus.channel
         if is_up(channel):
@@ -188,3 +189,43 @@ class BusEnd:
         self.reason = ""
         log.log(logging.DEBUG if self._told.quiet else logging.INFO, "%s", text)
         self._told.well()
+
+
+class ErrorFrameLimit:
+    """Error frames for the interface, one of state and one of anything else in ERROR_FRAME_INTERVAL_S.
+
+    Those that come sooner wait until `next_at`: of states the last one, of the others one that says all that
+    they say. Times are seconds of any clock.
+    """
+
+    def __init__(self) -> None:
+        self.next_at: float | None = None
+        self.left_out = 0
+        self._waiting: dict[bool, bytes] = {}  # by whether it is one of state
+        self._free_at = dict.fromkeys((False, True), -math.inf)
+
+    def add(self, frame: bytes, now: float) -> list[bytes]:
+        """Those that may go now."""
+        is_state = _is_state(frame)
+        before = self._waiting.get(is_state)
+        if before is not None:
+            self.left_out += 1
+            if not is_state:
+                frame = bytes(a | b for a, b in zip(before, frame, strict=True))
+        self._waiting[is_state] = frame
+        return self.take(now)
+
+    def take(self, now: float) -> list[bytes]:
+        """Those that may go now; with math.inf all."""
+        frames = []
+        for is_state in (False, True):  # a restart before the state after it
+            if is_state in self._waiting and now >= self._free_at[is_state]:
+                frames.append(self._waiting.pop(is_state))
+                self._free_at[is_state] = now + ERROR_FRAME_INTERVAL_S
+        self.next_at = min((self._free_at[is_state] for is_state in self._waiting), default=None)
+        return frames
+
+
+def _is_state(frame: bytes) -> bool:
+    can_id, _, data = FRAME.unpack(frame)
+    return bool(can_id & CAN_ERR_BUSOFF or data[1] & ~CRTL_RX_OVERFLOW)

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 from test_bridge import PairBus
 
-from bridged import bus_end
-from bridged.bus_end import RETRY_S, BusEnd
-from bridged.buses import socketcan
+from bridged.bridge import interface as bus_end
+from bridged.bridge.interface import RETRY_S, BusEnd
+from bridged.can import CAN_ERR_BUSERROR, CAN_ERR_CRTL, CAN_ERR_LOSTARB, error_frame
 from bridged.config import load
 from bridged.errors import BusError
-from bridged.health import CAN_ERR_BUSERROR, CAN_ERR_CRTL, CAN_ERR_LOSTARB, error_frame
+from bridged.interfaces import socketcan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,16 +1,18 @@
-"""Where frames go on the host."""
+"""What an open CAN interface of the host is, whichever kind it is."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from bridged.errors import BridgeError
 
 LOST_ERROR_FRAMES: Final = "bus-error-frame"
 """The reason in Bus.dropped() for error frames of ours: they are no frames of the adapter's."""
+
+
+LOST_BEFORE_READ: Final = ("socket-overflow", "bus-pump-overflow", "bus-recv-failed")
+"""Those for frames that were lost before the relay could read them."""
 
 
 class Bus(Protocol):
@@ -30,17 +32,3 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Let the bus go. Idempotent."""
-
-
-def open_bus(interface: str, channel: str, *, create: bool, options: Mapping[str, object]) -> Bus:
-    """Open `channel` of a python-can interface name; `socketcan` is the kernel's own and needs no python-can.
-
-    `create` is for socketcan alone, `options` for the others. Raises BusError, with what to do about it.
-    """
-    if interface == "socketcan":
-        from bridged.buses.socketcan import open_socketcan  # noqa: PLC0415 - only the kind that is used
-
-        return open_socketcan(channel, create)
-    from bridged.buses.python_can import open_python_can  # noqa: PLC0415 - python-can costs 85 ms and 19 MB
-
-    return open_python_can(interface, channel, options)

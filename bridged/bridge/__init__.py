@@ -1,0 +1,1 @@
+"""One bridge: its life, and the parts that decide for it."""

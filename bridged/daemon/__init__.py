@@ -1,0 +1,1 @@
+"""The process around a bridge: configuration, systemd, status, signals."""
