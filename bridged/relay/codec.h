@@ -39,15 +39,25 @@ enum { CODEC_KEPT_MAX = 20 }; /* bytes of the longest message of a binary protoc
 
 /* What a decoder must remember between two calls; zero it to start. */
 struct codec_state {
-    /* can232 */
-    bool discarding; /* inside a line that is too long: skip until its end */
-    bool dirty;      /* noise was skipped since the last end of line: an empty line means nothing now */
-    /* usb2can */
-    bool doubt;      /* not certain where messages begin: a frame counts once something valid follows it */
-    bool quiet;      /* set by the caller: nothing has come for long, decide with what there is */
-    uint8_t kept_length;
-    uint8_t kept[CODEC_KEPT_MAX];    /* the last message: the next may begin in it, where bytes were lost */
-    uint8_t spliced[CODEC_KEPT_MAX]; /* a message that did */
+    bool doubt; /* not certain where messages begin: a frame counts once something valid follows it */
+    bool quiet; /* set by the caller: nothing has come for quiet_ns, decide with what there is */
+    union {
+        struct {
+            bool discarding; /* inside a line that is too long: skip until its end */
+            bool dirty;      /* noise was skipped since the last end of line: an empty line means nothing now */
+        } can232;
+        struct {
+            uint8_t kept_length;
+            uint8_t kept[CODEC_KEPT_MAX];    /* the last message: the next may begin in it, where bytes were lost */
+            uint8_t spliced[CODEC_KEPT_MAX]; /* a message that did */
+        } usb2can;
+    };
+};
+
+/* How the device says what became of the frames that it was sent. */
+enum codec_confirms {
+    CONFIRMS_EACH,  /* it answers each frame, in order: CODEC_OK, CODEC_SENT or CODEC_REFUSED */
+    CONFIRMS_LEVEL, /* it hands back what has no room, and tells on a question how full its buffer is */
 };
 
 /*
@@ -60,15 +70,23 @@ struct codec_state {
  * encode: writes one frame as the device wants it, returns its length, 0 if the frame cannot be said in
  * this protocol. Never writes more than frame_max bytes.
  *
- * level: how many frames wait in the device's transmit buffer, if a CODEC_TEXT tells it, else -1. NULL:
- * the device answers each frame, by CODEC_OK, CODEC_SENT or CODEC_REFUSED.
+ * level: with CONFIRMS_LEVEL, how many frames wait in the device's transmit buffer, if a CODEC_TEXT tells it, else -1.
  *
  * length: of the message to the device that begins at message[0], of n bytes where it and others are.
+ *
+ * quiet_ns, doubt_quiet_ns: a protocol without ends of lines has no other sign of lost bytes than the time. When
+ * bytes that wait for more, of a message or (while `doubt`) behind a frame, have got nothing for so long, the caller
+ * decodes them with `quiet` set. 0: they wait for ever, the next end of a line tells.
+ *
+ * reports: the device also sends texts that nobody asked for.
  */
 struct codec {
     const char *name;
     size_t line_max;
     size_t frame_max;
+    enum codec_confirms confirms;
+    bool reports;
+    int64_t quiet_ns, doubt_quiet_ns;
     size_t (*decode)(struct codec_state *state, const uint8_t *in, size_t n, struct can_frame *frame,
                      struct codec_message *msg);
     size_t (*encode)(const struct can_frame *frame, uint8_t *out);

@@ -154,8 +154,8 @@ static size_t long_line_skip(struct codec_state *state, const uint8_t *in, size_
         end++;
     if (end == n)
         return report(msg, CODEC_SKIPPED, n);
-    state->discarding = false;
-    state->dirty = false;
+    state->can232.discarding = false;
+    state->can232.dirty = false;
     return report(msg, CODEC_SKIPPED, in[end] == CR ? end + 1 : end);
 }
 
@@ -164,7 +164,7 @@ static size_t noise_skip(struct codec_state *state, const uint8_t *in, size_t n,
     size_t end = 1;
     while (end < n && is_noise(in[end]))
         end++;
-    state->dirty = true;
+    state->can232.dirty = true;
     return report(msg, CODEC_SKIPPED, end);
 }
 
@@ -179,13 +179,13 @@ static size_t line_decode(struct codec_state *state, const uint8_t *in, size_t n
         end++;
     }
     if (end == CAN232_LINE_MAX) {
-        state->discarding = true;
+        state->can232.discarding = true;
         return report(msg, CODEC_SKIPPED, end);
     }
     if (end == n)
         return 0;
 
-    state->dirty = false;
+    state->can232.dirty = false;
     if (in[end] == BELL)
         return report(msg, CODEC_SKIPPED, end);
     if (!printable || is_frame_letter(in[0]))
@@ -200,8 +200,8 @@ static size_t line_decode(struct codec_state *state, const uint8_t *in, size_t n
 
 static size_t empty_line_decode(struct codec_state *state, struct codec_message *msg)
 {
-    enum codec_kind kind = state->dirty ? CODEC_SKIPPED : CODEC_OK;
-    state->dirty = false;
+    enum codec_kind kind = state->can232.dirty ? CODEC_SKIPPED : CODEC_OK;
+    state->can232.dirty = false;
     return report(msg, kind, 1);
 }
 
@@ -210,14 +210,14 @@ static size_t can232_decode(struct codec_state *state, const uint8_t *in, size_t
 {
     if (n == 0)
         return 0;
-    if (state->discarding) {
+    if (state->can232.discarding) {
         size_t skipped = long_line_skip(state, in, n, msg);
         if (skipped > 0)
             return skipped;
     }
     size_t taken = frame_decode(in, n, frame, msg);
     if (taken > 0) {
-        state->dirty = false;
+        state->can232.dirty = false;
         return taken;
     }
     switch (in[0]) {
@@ -226,7 +226,7 @@ static size_t can232_decode(struct codec_state *state, const uint8_t *in, size_t
     case LF:
         return report(msg, CODEC_IDLE, 1);
     case BELL:
-        state->dirty = false;
+        state->can232.dirty = false;
         return report(msg, CODEC_REFUSED, 1);
     default:
         return is_noise(in[0]) ? noise_skip(state, in, n, msg) : line_decode(state, in, n, msg);
@@ -270,6 +270,7 @@ const struct codec codec_can232 = {
     .name = "can232",
     .line_max = CAN232_LINE_MAX,
     .frame_max = CAN232_FRAME_MAX,
+    .confirms = CONFIRMS_EACH,
     .decode = can232_decode,
     .encode = can232_encode,
     .length = can232_length,

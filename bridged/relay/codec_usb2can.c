@@ -253,10 +253,10 @@ static size_t message_take(struct codec_state *state, const uint8_t *in, size_t 
         msg->length = length - 1;
     }
     if (n >= CODEC_KEPT_MAX)
-        memcpy(state->kept, in, CODEC_KEPT_MAX); /* as with the data: fast, and the rest is not looked at */
+        memcpy(state->usb2can.kept, in, CODEC_KEPT_MAX); /* as with the data: fast, and the rest is not looked at */
     else
-        memcpy(state->kept, in, length);
-    state->kept_length = (uint8_t)length;
+        memcpy(state->usb2can.kept, in, length);
+    state->usb2can.kept_length = (uint8_t)length;
     state->doubt = false;
     return length;
 }
@@ -288,8 +288,8 @@ static int lost_bytes_decode(struct codec_state *state, const uint8_t *in, size_
 {
     uint8_t joined[CODEC_KEPT_MAX + USB2CAN_LINE_MAX];
     bool follows[CODEC_KEPT_MAX + 1] = {false}; /* a message, whole in the last one: that confirms as well */
-    size_t kept = state->kept_length;
-    memcpy(joined, state->kept, kept);
+    size_t kept = state->usb2can.kept_length;
+    memcpy(joined, state->usb2can.kept, kept);
     n = min_size(n, USB2CAN_LINE_MAX);
     memcpy(joined + kept, in, n);
 
@@ -305,8 +305,8 @@ static int lost_bytes_decode(struct codec_state *state, const uint8_t *in, size_
             return MORE;
         if (length <= 0)
             continue;
-        memcpy(state->spliced, joined + at, (size_t)length);
-        message_take(state, state->spliced, (size_t)length, (size_t)length, frame, msg);
+        memcpy(state->usb2can.spliced, joined + at, (size_t)length);
+        message_take(state, state->usb2can.spliced, (size_t)length, (size_t)length, frame, msg);
         return (int)(at + (size_t)length - kept);
     }
     return NONE;
@@ -317,7 +317,7 @@ static size_t noise_skip(struct codec_state *state, const uint8_t *in, size_t n,
 {
     const uint8_t *next = memchr(in + 1, START, n - 1);
     state->doubt = true;
-    state->kept_length = 0;
+    state->usb2can.kept_length = 0;
     return report(msg, CODEC_SKIPPED, next ? (size_t)(next - in) : n);
 }
 
@@ -399,6 +399,10 @@ const struct codec codec_usb2can = {
     .name = "usb2can",
     .line_max = USB2CAN_LINE_MAX,
     .frame_max = HEAD + FRAME_BYTES_MAX,
+    .confirms = CONFIRMS_LEVEL,
+    .reports = true,
+    .quiet_ns = 1000000000,
+    .doubt_quiet_ns = 50000000,
     .decode = usb2can_decode,
     .encode = usb2can_encode,
     .level = usb2can_level,

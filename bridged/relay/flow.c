@@ -16,7 +16,7 @@
 
 bool flow_used(const struct relay *r)
 {
-    return r->set.codec->level;
+    return r->set.codec->confirms == CONFIRMS_LEVEL;
 }
 
 static struct tx_frame *sent_at(struct flow *f, uint32_t i)

@@ -15,8 +15,6 @@
 
 #define RX_STALL_NS INT64_C(100000000) /* how long frames wait for a full bus queue */
 #define RX_RETRY_NS INT64_C(1000000)
-#define DOUBT_QUIET_NS INT64_C(50000000)     /* until a frame counts that nothing has followed yet */
-#define PARTIAL_QUIET_NS INT64_C(1000000000) /* until the beginning of a message counts as noise */
 #define STAMP_MAX_S INT64_C(4102444800)      /* the year 2100 */
 
 #ifndef SYS_epoll_pwait2
@@ -301,12 +299,13 @@ static void port_decode(struct relay *r, int64_t now)
 }
 
 /* Bytes that wait for more may be a message of which some were lost, and must not become one with
- * those that come much later. A binary protocol has no other sign of it than the time. */
+ * those that come much later. */
 static void quiet_start(struct relay *r, int64_t now)
 {
+    const struct codec *codec = r->set.codec;
     r->quiet_at_ns = NEVER;
-    if (r->in_length && flow_used(r))
-        r->quiet_at_ns = now + (r->decoder.doubt ? DOUBT_QUIET_NS : PARTIAL_QUIET_NS);
+    if (r->in_length && codec->quiet_ns)
+        r->quiet_at_ns = now + (r->decoder.doubt ? codec->doubt_quiet_ns : codec->quiet_ns);
 }
 
 static void quiet_over(struct relay *r, int64_t now)

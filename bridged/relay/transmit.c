@@ -237,7 +237,7 @@ static void answer_text(struct relay *r, const struct codec_message *msg, int64_
         inflight_settle(r, EVENT_TEXT, msg, now);
         return;
     }
-    if (!flow_used(r)) /* else it may be a report */
+    if (!r->set.codec->reports)
         r->count.stray_answers++;
     relay_emit(r, EVENT_UNASKED, 0, msg->text, msg->length);
 }

@@ -370,13 +370,13 @@ static void test_each_byte(void)
 static void test_nothing(void)
 {
     uint8_t *nothing = malloc(1);
-    struct codec_state state = {0}, discarding = {.discarding = true, .dirty = true};
+    struct codec_state state = {0}, discarding = {.can232 = {.discarding = true, .dirty = true}};
     struct codec_message msg;
     struct can_frame frame;
 
     CHECK(nothing && codec->decode(&state, nothing + 1, 0, &frame, &msg) == 0);
     CHECK(nothing && codec->decode(&discarding, nothing + 1, 0, &frame, &msg) == 0);
-    CHECK(discarding.discarding && discarding.dirty);
+    CHECK(discarding.can232.discarding && discarding.can232.dirty);
     free(nothing);
 }
 
