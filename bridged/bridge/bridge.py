@@ -120,6 +120,7 @@ class Bridge:
             queue=config.transmit.queue,
             window=config.transmit.window,
             deadline=config.transmit.deadline_s,
+            stuck=stuck_s(config),
             answer_timeout=self.adapter.answer_timeout_s,
             sync=sync.request,
             sync_prefix=sync.prefix,
@@ -244,7 +245,7 @@ class Bridge:
         ):
             return False
         self.config = config
-        self._relay.set_queue(transmit.queue, transmit.deadline_s)
+        self._relay.set_queue(transmit.queue, transmit.deadline_s, stuck_s(config))
         self._bus_end.adopt(config)
         self._bus_off.config = config
         self._polling.adopt(config.health.interval_s, stuck_s(config))

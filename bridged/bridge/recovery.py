@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-STUCK_LEAST_S = 0.5  # as STUCK_LEAST_NS in queue.c
+STUCK_LEAST_S = 0.5  # a slow, busy bus is no reason
 REFUSING_S, REFUSING_LONGEST_S = 60.0, 3600.0
 
 ANEW = (

@@ -70,7 +70,8 @@ enum codec_confirms {
  * encode: writes one frame as the device wants it, returns its length, 0 if the frame cannot be said in
  * this protocol. Never writes more than frame_max bytes.
  *
- * level: with CONFIRMS_LEVEL, how many frames wait in the device's transmit buffer, if a CODEC_TEXT tells it, else -1.
+ * level: with CONFIRMS_LEVEL, how many frames wait in the device's transmit buffer, if a CODEC_TEXT tells it,
+ * else -1.
  *
  * length: of the message to the device that begins at message[0], of n bytes where it and others are.
  *

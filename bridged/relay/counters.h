@@ -8,7 +8,7 @@
 
 #include <stdint.h>
 
-/* Why a frame from the bus was not sent. */
+/* Why a frame from the interface was not sent. */
 #define TX_DROP_LIST(X) \
     X(TX_ERROR_FRAME, "error-frame", "error frames are the bus's own affair") \
     X(TX_FD_FRAME, "fd-frame", "the adapter knows classic CAN only") \
@@ -22,12 +22,12 @@
     X(TX_LISTEN_ONLY, "listen-only", "the channel is listen-only") \
     X(TX_STOPPED, "stopped", "the bridge is stopping")
 
-/* Why a frame from the adapter did not reach the bus. */
+/* Why a frame from the adapter did not reach the interface. */
 #define RX_DROP_LIST(X) \
     X(RX_NOT_RUNNING, "not-running", "decoded while the adapter was being initialised or closed") \
-    X(RX_BUS_FULL, "bus-queue-full", "the interface had no room for RX_STALL_NS, or more than RX_BATCH frames waited") \
-    X(RX_BUS_DOWN, "bus-down", "the interface is down (ENETDOWN)") \
-    X(RX_BUS_LOST, "bus-lost", "the interface is gone, or none is attached")
+    X(RX_INTERFACE_FULL, "bus-queue-full", "the interface had no room for 0.1 s, or more than 256 frames waited") \
+    X(RX_INTERFACE_DOWN, "bus-down", "the interface is down (ENETDOWN)") \
+    X(RX_INTERFACE_LOST, "bus-lost", "the interface is gone, or none is attached")
 
 /* What events() returns. The name in Python is that of the enumerator. */
 #define EVENT_LIST(X) \
@@ -40,7 +40,7 @@
     X(EVENT_FRAME_REFUSED, "the adapter refused a frame; token: how many retries so far. Not at each") \
     X(EVENT_UNANSWERED, "an answer is missing: the line is being resynchronised") \
     X(EVENT_SILENT, "not even the sync command is answered; nothing is sent until a new attach") \
-    X(EVENT_STUCK, "no frame has left the device's buffer for stuck_ns(); token: how many, 0: not known") \
+    X(EVENT_STUCK, "no frame has left the device's buffer for `stuck` seconds; token: how many, 0: not known") \
     X(EVENT_STAMPED, "a frame had a time stamp; said once per attach") \
     X(EVENT_PORT_LOST, "token: errno, 0 for end of file") \
     X(EVENT_BUS_DOWN, "the interface is down") \
@@ -48,13 +48,13 @@
 
 /* Each is a field of struct counters. */
 #define COUNTER_LIST(X) \
-    X(bus_read, "bus_read", "frames read from the bus") \
+    X(interface_read, "bus_read", "frames read from the interface") \
     X(confirmed, "tx_frames", "frames that the adapter took") \
     X(retries, "tx_retries", "frames sent once more after a refusal") \
     X(returned, "tx_returned", "frames that the adapter handed back") \
     X(stops, "tx_stops", "how often the adapter said that its transmit buffer is nearly full") \
     X(decoded, "decoded", "frames decoded from the port") \
-    X(delivered, "rx_frames", "frames put on the bus") \
+    X(delivered, "rx_frames", "frames put on the interface") \
     X(overruns, "rx_overruns", "how often the adapter said that it lost frames") \
     X(stamped, "rx_stamped", "frames that carried a time stamp") \
     X(skipped_messages, "skipped_messages", "pieces of noise between messages") \

@@ -6,6 +6,8 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "clock.h"
+
 #define NAME_AND_VALUE(name, ...) {#name, name},
 
 static const struct {
@@ -33,22 +35,6 @@ typedef struct {
 static struct relay *self_relay(PyObject *self)
 {
     return ((RelayObject *)self)->relay;
-}
-
-/* The loop thread holds the lock only for one turn, never waits with it and never needs the GIL. */
-static struct relay *locked(PyObject *self)
-{
-    struct relay *r = self_relay(self);
-    relay_lock(r);
-    return r;
-}
-
-/* After a change that the loop must see. */
-static PyObject *unlock_wake(struct relay *r)
-{
-    relay_unlock(r);
-    relay_wake(r);
-    Py_RETURN_NONE;
 }
 
 static PyObject *raise_errno(int error)
@@ -104,14 +90,25 @@ static int command_init(struct command *c, const Py_buffer *data, int accept, co
     return 0;
 }
 
-static int settings_check(const struct settings *s, double deadline, double answer_timeout)
+/* What Python says of the queue. -> 0, or -1 with an exception */
+static int queue_settings_from(struct queue_settings *set, uint32_t size, double deadline, double stuck)
 {
-    if (s->queue < 1 || s->queue > QUEUE_MAX || s->window < 1 || s->window > WINDOW_MAX) {
-        PyErr_Format(PyExc_ValueError, "queue is 1 to %d, window 1 to %d", QUEUE_MAX, WINDOW_MAX);
+    if (size < 1 || size > QUEUE_MAX || !seconds_valid(deadline) || !seconds_valid(stuck)) {
+        PyErr_Format(PyExc_ValueError, "queue is 1 to %d, deadline and stuck are seconds, more than 0", QUEUE_MAX);
         return -1;
     }
-    if (!seconds_valid(deadline) || !seconds_valid(answer_timeout)) {
-        PyErr_SetString(PyExc_ValueError, "deadline and answer_timeout are seconds, more than 0");
+    *set = (struct queue_settings){size, seconds_to_ns(deadline), seconds_to_ns(stuck)};
+    return 0;
+}
+
+static int settings_check(const struct settings *s, double answer_timeout)
+{
+    if (s->window < 1 || s->window > WINDOW_MAX) {
+        PyErr_Format(PyExc_ValueError, "window is 1 to %d", WINDOW_MAX);
+        return -1;
+    }
+    if (!seconds_valid(answer_timeout)) {
+        PyErr_SetString(PyExc_ValueError, "answer_timeout is seconds, more than 0");
         return -1;
     }
     return 0;
@@ -119,21 +116,22 @@ static int settings_check(const struct settings *s, double deadline, double answ
 
 static PyObject *Relay_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
 {
-    static char *names[] = {"codec", "queue", "window", "deadline", "answer_timeout", "sync", "sync_prefix", NULL};
+    static char *names[] = {"codec", "queue", "window", "deadline", "stuck", "answer_timeout", "sync", "sync_prefix",
+                            NULL};
     struct settings set = {0};
     const char *codec;
-    double deadline, answer_timeout;
+    uint32_t queue;
+    double deadline, stuck, answer_timeout;
     Py_buffer sync, prefix;
     RelayObject *self = NULL;
 
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$O&O&ddy*y*:Relay", names, &codec, uint32_from, &set.queue,
-                                     uint32_from, &set.window, &deadline, &answer_timeout, &sync, &prefix))
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "s$O&O&dddy*y*:Relay", names, &codec, uint32_from, &queue,
+                                     uint32_from, &set.window, &deadline, &stuck, &answer_timeout, &sync, &prefix))
         return NULL;
     set.codec = codec_by_name(codec);
-    if (!set.codec || settings_check(&set, deadline, answer_timeout) < 0
-        || command_init(&set.sync, &sync, 0, &prefix) < 0)
+    if (!set.codec || queue_settings_from(&set.queue, queue, deadline, stuck) < 0
+        || settings_check(&set, answer_timeout) < 0 || command_init(&set.sync, &sync, 0, &prefix) < 0)
         goto done;
-    set.deadline_ns = seconds_to_ns(deadline);
     set.answer_timeout_ns = seconds_to_ns(answer_timeout);
     allocfunc alloc = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     self = (RelayObject *)alloc(type, 0);
@@ -168,7 +166,7 @@ static PyObject *Relay_run(PyObject *self, PyObject *Py_UNUSED(ignored))
     Py_RETURN_NONE;
 }
 
-/* A time of the tests' clocks: what the relay adds to it, below 1e6 s, must not overflow. */
+/* A time of the tests' clocks: what the relay adds to it, below 1e6 s, must not overset. */
 static int clock_from(PyObject *number, void *ns)
 {
     int64_t value = PyLong_AsLongLong(number);
@@ -187,9 +185,7 @@ static PyObject *Relay_turn(PyObject *self, PyObject *args)
     struct moment at = {0};
     if (!PyArg_ParseTuple(args, "O&|O&:turn", clock_from, &at.boot_ns, clock_from, &at.wall_ns))
         return NULL;
-    struct relay *r = locked(self);
-    int64_t next = relay_turn(r, at);
-    relay_unlock(r);
+    int64_t next = relay_turn(self_relay(self), at);
     if (next == NEVER)
         Py_RETURN_NONE;
     return PyLong_FromLongLong(next);
@@ -197,9 +193,8 @@ static PyObject *Relay_turn(PyObject *self, PyObject *args)
 
 static PyObject *Relay_stop(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    r->stop = true;
-    return unlock_wake(r);
+    relay_stop(self_relay(self));
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_wake(PyObject *self, PyObject *Py_UNUSED(ignored))
@@ -210,7 +205,7 @@ static PyObject *Relay_wake(PyObject *self, PyObject *Py_UNUSED(ignored))
 
 static PyObject *Relay_fileno(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    return PyLong_FromLong(self_relay(self)->event_fd);
+    return PyLong_FromLong(relay_event_fd(self_relay(self)));
 }
 
 static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
@@ -218,10 +213,7 @@ static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
     int fd = PyObject_AsFileDescriptor(arg);
     if (fd < 0)
         return NULL;
-    struct relay *r = locked(self);
-    int error = relay_attach_port(r, fd);
-    relay_unlock(r);
-    relay_wake(r);
+    int error = relay_attach_port(self_relay(self), fd);
     if (error)
         return raise_errno(error);
     Py_RETURN_NONE;
@@ -229,18 +221,14 @@ static PyObject *Relay_attach_port(PyObject *self, PyObject *arg)
 
 static PyObject *Relay_detach_port(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    relay_detach_port(r);
-    return unlock_wake(r);
+    relay_detach_port(self_relay(self));
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_cut(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    const struct cut cut = transmit_cut(r);
-    bool unread = r->unread;
-    relay_unlock(r);
-    return Py_BuildValue("(Ny#n)", PyBool_FromLong(unread), (const char *)cut.message, (Py_ssize_t)cut.length,
+    const struct cut cut = relay_cut(self_relay(self));
+    return Py_BuildValue("(Ny#n)", PyBool_FromLong(cut.unread), (const char *)cut.message, (Py_ssize_t)cut.length,
                          (Py_ssize_t)cut.taken);
 }
 
@@ -262,9 +250,8 @@ static PyObject *Relay_resume(PyObject *self, PyObject *args)
         PyErr_SetString(PyExc_ValueError, "resume takes what cut() gave, of which a part was taken");
         return NULL;
     }
-    struct relay *r = locked(self);
-    transmit_resume(r, &cut);
-    return unlock_wake(r);
+    relay_resume(self_relay(self), &cut);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_last_words(PyObject *self, PyObject *arg)
@@ -272,10 +259,9 @@ static PyObject *Relay_last_words(PyObject *self, PyObject *arg)
     Py_buffer words;
     if (PyObject_GetBuffer(arg, &words, PyBUF_SIMPLE) < 0)
         return NULL;
-    struct relay *r = locked(self);
-    transmit_last_words(r, words.buf, (size_t)words.len);
+    relay_last_words(self_relay(self), words.buf, (size_t)words.len);
     PyBuffer_Release(&words);
-    return unlock_wake(r);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
@@ -283,10 +269,7 @@ static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
     int fd = PyObject_AsFileDescriptor(arg);
     if (fd < 0)
         return NULL;
-    struct relay *r = locked(self);
-    int error = relay_attach_bus(r, fd);
-    relay_unlock(r);
-    relay_wake(r);
+    int error = relay_attach_interface(self_relay(self), fd);
     if (error)
         return raise_errno(error);
     Py_RETURN_NONE;
@@ -294,9 +277,8 @@ static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
 
 static PyObject *Relay_detach_bus(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    relay_detach_bus(r);
-    return unlock_wake(r);
+    relay_detach_interface(self_relay(self));
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_hold_bus(PyObject *self, PyObject *arg)
@@ -304,9 +286,8 @@ static PyObject *Relay_hold_bus(PyObject *self, PyObject *arg)
     int held = PyObject_IsTrue(arg);
     if (held < 0)
         return NULL;
-    struct relay *r = locked(self);
-    relay_hold_bus(r, held);
-    return unlock_wake(r);
+    relay_hold_interface(self_relay(self), held);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwargs)
@@ -319,30 +300,20 @@ static PyObject *Relay_set_gates(PyObject *self, PyObject *args, PyObject *kwarg
         PyErr_SetString(PyExc_ValueError, "transmit is one of the GATE_ constants");
         return NULL;
     }
-    struct relay *r = locked(self);
-    r->receiving = receiving;
-    queue_set_gate(r, (enum gate)gate);
-    return unlock_wake(r);
+    relay_set_gates(self_relay(self), receiving, (enum gate)gate);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_set_queue(PyObject *self, PyObject *args)
 {
+    struct queue_settings set;
     uint32_t size;
-    double deadline;
-    if (!PyArg_ParseTuple(args, "O&d:set_queue", uint32_from, &size, &deadline))
+    double deadline, stuck;
+    if (!PyArg_ParseTuple(args, "O&dd:set_queue", uint32_from, &size, &deadline, &stuck)
+        || queue_settings_from(&set, size, deadline, stuck) < 0)
         return NULL;
-    if (size < 1 || size > QUEUE_MAX || !seconds_valid(deadline)) {
-        PyErr_Format(PyExc_ValueError, "queue is 1 to %d, deadline is seconds, more than 0", QUEUE_MAX);
-        return NULL;
-    }
-    struct relay *r = locked(self);
-    int error = queue_resize(r, size);
-    if (!error)
-        r->set.deadline_ns = seconds_to_ns(deadline);
-    relay_unlock(r);
-    if (error)
+    if (relay_set_queue(self_relay(self), &set))
         return PyErr_NoMemory();
-    relay_wake(r);
     Py_RETURN_NONE;
 }
 
@@ -362,24 +333,21 @@ static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
     PyBuffer_Release(&prefix);
     if (result < 0)
         return NULL;
-    struct relay *r = locked(self);
-    r->poll = c;
-    r->poll_interval_ns = seconds_to_ns(interval);
-    r->poll_at_ns = 0;
-    return unlock_wake(r);
+    relay_set_polling(self_relay(self), &c, seconds_to_ns(interval));
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"ask", "prefix", "capacity", "critical", "ready", NULL};
-    struct flow flow = {0};
+    struct level_settings set = {0};
     Py_buffer ask, prefix;
     if (!PyArg_ParseTupleAndKeywords(args, kwargs, "y*y*$O&O&O&:set_flow", names, &ask, &prefix, uint32_from,
-                                     &flow.capacity, uint32_from, &flow.critical, uint32_from, &flow.ready))
+                                     &set.capacity, uint32_from, &set.critical, uint32_from, &set.ready))
         return NULL;
-    int result = command_init(&flow.ask, &ask, 0, &prefix);
-    if (!result && (flow.capacity < 1 || flow.capacity > UINT8_MAX || flow.critical > flow.capacity
-                    || flow.ready >= flow.critical)) {
+    int result = command_init(&set.ask, &ask, 0, &prefix);
+    if (!result && (set.capacity < 1 || set.capacity > UINT8_MAX || set.critical > set.capacity
+                    || set.ready >= set.critical)) {
         PyErr_SetString(PyExc_ValueError, "ready < critical <= capacity <= 255 is wanted");
         result = -1;
     }
@@ -387,9 +355,8 @@ static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs
     PyBuffer_Release(&prefix);
     if (result < 0)
         return NULL;
-    struct relay *r = locked(self);
-    flow_start(r, &flow);
-    return unlock_wake(r);
+    relay_set_level_window(self_relay(self), &set);
+    Py_RETURN_NONE;
 }
 
 static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
@@ -415,32 +382,13 @@ static PyObject *Relay_command(PyObject *self, PyObject *args, PyObject *kwargs)
         return NULL;
     c.token = token;
     c.timeout_ns = seconds_to_ns(timeout);
-    struct relay *r = locked(self);
-    bool taken = r->port >= 0 && transmit_command(r, &c);
-    if (!taken) /* no port, or more commands waiting than can ever be meant */
-        relay_emit(r, EVENT_TIMEOUT, token, NULL, 0);
-    if (!more)
-        return unlock_wake(r);
-    relay_unlock(r);
+    relay_command(self_relay(self), &c, more);
     Py_RETURN_NONE;
 }
 
 static PyObject *event_object(const struct event *e)
 {
     return Py_BuildValue("(iIy#)", e->kind, e->token, (const char *)e->text, (Py_ssize_t)e->length);
-}
-
-/* -> how many events are in `batch`: the oldest, EVENTS_BATCH at most */
-static uint32_t take_events(PyObject *self, struct event *batch)
-{
-    struct relay *r = locked(self);
-    uint32_t n = r->event_count < EVENTS_BATCH ? r->event_count : EVENTS_BATCH;
-    for (uint32_t i = 0; i < n; i++)
-        batch[i] = r->events[(r->event_head + i) % EVENTS_MAX];
-    r->event_head = (r->event_head + n) % EVENTS_MAX;
-    r->event_count -= n;
-    relay_unlock(r);
-    return n;
 }
 
 /* At most EVENTS_MAX, or a flood would keep the caller here. They are all that there were when the eventfd was reset;
@@ -452,10 +400,10 @@ static PyObject *Relay_events(PyObject *self, PyObject *Py_UNUSED(ignored))
     if (!list)
         return NULL;
     uint64_t value;
-    ssize_t ignored = read(self_relay(self)->event_fd, &value, sizeof value);
+    ssize_t ignored = read(relay_event_fd(self_relay(self)), &value, sizeof value);
     (void)ignored;
     for (uint32_t taken = 0, n = EVENTS_BATCH; n == EVENTS_BATCH && taken < EVENTS_MAX; taken += n) {
-        n = take_events(self, batch);
+        n = relay_take_events(self_relay(self), batch, EVENTS_BATCH);
         for (uint32_t i = 0; i < n; i++) {
             PyObject *item = event_object(&batch[i]);
             int result = item ? PyList_Append(list, item) : -1;
@@ -471,29 +419,25 @@ static PyObject *Relay_events(PyObject *self, PyObject *Py_UNUSED(ignored))
 
 static PyObject *Relay_counters(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    const struct counters count = r->count;
-    uint64_t queued = transmit_queued(r), pending = r->rx_count;
-    relay_unlock(r);
-    return counters_dict(&count, queued, pending);
+    struct snapshot now;
+    relay_snapshot(self_relay(self), &now);
+    return counters_dict(&now);
 }
 
-/* The buffers of the last batch each way; bytes of a message that was no frame may be among them. */
 static PyObject *Relay_glimpse(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    struct can_frame from_bus = r->bus_message[0].frame.classic, to_bus = r->rx[0];
-    relay_unlock(r);
-    return Py_BuildValue("y#y#", (const char *)&from_bus, (Py_ssize_t)sizeof from_bus, (const char *)&to_bus,
-                         (Py_ssize_t)sizeof to_bus);
+    struct can_frame from, to;
+    relay_glimpse(self_relay(self), &from, &to);
+    return Py_BuildValue("y#y#", (const char *)&from, (Py_ssize_t)sizeof from, (const char *)&to,
+                         (Py_ssize_t)sizeof to);
 }
 
 static PyObject *Relay_tally(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
-    struct relay *r = locked(self);
-    const struct counters c = r->count;
-    relay_unlock(r);
-    return Py_BuildValue("(KKKKK)", c.decoded, c.delivered, c.confirmed, c.overruns, c.skipped_bytes);
+    struct snapshot now;
+    relay_snapshot(self_relay(self), &now);
+    const struct counters *c = &now.counters;
+    return Py_BuildValue("(KKKKK)", c->decoded, c->delivered, c->confirmed, c->overruns, c->skipped_bytes);
 }
 
 static PyMethodDef RELAY_METHODS[] = {
@@ -523,7 +467,7 @@ static PyMethodDef RELAY_METHODS[] = {
 };
 
 static PyType_Slot RELAY_SLOTS[] = {
-    {Py_tp_doc, "Relay of frames between a port and a bus; see _relay.pyi."},
+    {Py_tp_doc, "Relay of frames between a port and an interface; see _relay.pyi."},
     {Py_tp_new, Relay_new},
     {Py_tp_dealloc, Relay_dealloc},
     {Py_tp_methods, RELAY_METHODS},
@@ -539,7 +483,7 @@ static PyType_Spec RELAY_SPEC = {
 
 static PyObject *module_clock(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(ignored))
 {
-    return PyLong_FromLongLong(relay_clock());
+    return PyLong_FromLongLong(clock_now_ns());
 }
 
 static PyMethodDef MODULE_METHODS[] = {

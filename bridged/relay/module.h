@@ -11,6 +11,6 @@ const struct codec *codec_by_name(const char *name); /* NULL with ValueError */
 PyObject *module_decode(PyObject *module, PyObject *args);
 PyObject *module_encode(PyObject *module, PyObject *args);
 PyObject *module_meanings(PyObject *module, PyObject *ignored);
-PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64_t pending);
+PyObject *counters_dict(const struct snapshot *s);
 
 #endif

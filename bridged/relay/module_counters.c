@@ -24,15 +24,16 @@ static PyObject *reasons_dict(const char *const *names, const uint64_t *values, 
 
 #define NAME_AND_VALUE(field, python, meaning) {python, c->field},
 
-PyObject *counters_dict(const struct counters *c, uint64_t queued, uint64_t pending)
+PyObject *counters_dict(const struct snapshot *s)
 {
+    const struct counters *c = &s->counters;
     const struct {
         const char *name;
         uint64_t value;
     } plain[] = {
         COUNTER_LIST(NAME_AND_VALUE)
-        {"queued", queued},
-        {"rx_pending", pending},
+        {"queued", s->queued},
+        {"rx_pending", s->pending},
     };
     PyObject *dict = PyDict_New();
     for (size_t i = 0; dict && i < sizeof plain / sizeof plain[0]; i++)

@@ -1,524 +1,351 @@
-/* Bus -> device: the window of unanswered commands, and what answers do to it.
- *
- * The device answers in the order of its commands. So an answer belongs to the oldest command in
- * flight, and a text that answers a later one proves that the answers before it were lost.
- * A device that does not answer frames has another window for them: flow.c. */
-#include "relay.h"
+/* What goes to the device next, and what answers do to it. */
+#include "transmit.h"
 
 #include <errno.h>
 #include <string.h>
-#include <unistd.h>
 
-#define RETRY_FIRST_NS INT64_C(1000000)
-#define RETRY_LAST_NS INT64_C(16000000)
-#define RETRIES_TOLD 16 /* about four times a second */
-
-static struct inflight *inflight_at(struct relay *r, uint32_t i)
+void transmit_init(struct transmit *t, struct queue *queue, struct line *line, struct ack_window *ack,
+                   struct level_window *level)
 {
-    return &r->inflight[(r->inflight_head + i) % INFLIGHT_MAX];
-}
-
-/* Grows with everything from the device that was no message, or one that nobody waits for. */
-static uint64_t line_noise(const struct relay *r)
-{
-    return r->count.skipped_bytes + r->count.stray_answers;
-}
-
-/* Noise since a refusal, before it was checked, may have been the answer that the frame was taken. */
-static void retry_disbelieve(struct relay *r)
-{
-    for (; r->retry_count && line_noise(r) != r->check_noise; retry_pop(r))
-        queue_drop(r, TX_UNANSWERED);
-}
-
-/* The oldest command in flight is over without an answer of its own. */
-static void inflight_give_up(struct relay *r)
-{
-    const struct inflight *head = inflight_at(r, 0);
-
-    if (head->kind == INFLIGHT_FRAME)
-        queue_drop(r, TX_UNANSWERED);
-    else if (head->kind == INFLIGHT_COMMAND)
-        relay_emit(r, EVENT_TIMEOUT, head->token, NULL, 0);
-    else if (head->kind == INFLIGHT_POLL)
-        r->polling = false;
-    else if (head->kind == INFLIGHT_LEVEL)
-        flow_unanswered(r);
-    else if (r->checking) {
-        r->checking = false;
-        retry_disbelieve(r);
-    }
-    r->inflight_head = (r->inflight_head + 1) % INFLIGHT_MAX;
-    r->inflight_count--;
-}
-
-/* With a window above 1 and an answer missing, a refusal may have been another frame's. What was
- * refused while anything is still in flight is not sent again. */
-static void retry_doubt(struct relay *r)
-{
-    for (; !flow_used(r) && r->set.window > 1 && r->inflight_count && r->retry_count; retry_pop(r))
-        queue_drop(r, TX_UNANSWERED);
-}
-
-/* Of `out` nothing stays but the message of which the port took a part. (None is longer than COMMAND_SIZE, but for
- * commands without an end.) */
-static void out_cut(struct relay *r)
-{
-    size_t at = 0, next = 0;
-    while (next < r->out_start) {
-        at = next;
-        next += r->set.codec->length(r->out + at, r->out_end - at);
-    }
-    if (next == r->out_start || next - at > COMMAND_SIZE)
-        at = next = r->out_start;
-    memmove(r->out, r->out + at, next - at);
-    r->out_start -= at;
-    r->out_end = next - at;
-    r->out_until_ns = NEVER;
-}
-
-struct cut transmit_cut(const struct relay *r)
-{
-    struct cut cut = {.taken = r->out_start, .length = r->out_end};
-    memcpy(cut.message, r->out, cut.length);
-    return cut;
-}
-
-/* The port is that of the cut: the rest goes before all else. */
-void transmit_resume(struct relay *r, const struct cut *cut)
-{
-    memcpy(r->out, cut->message, cut->length);
-    r->out_start = cut->taken;
-    r->out_end = cut->length;
-}
-
-/* The port is new, or that of a device whose cut is not to be finished. */
-void transmit_forget(struct relay *r)
-{
-    r->out_start = r->out_end = 0;
-    r->unread = false;
-}
-
-/* The port is gone or new: what was in flight will never be answered. */
-void transmit_reset(struct relay *r)
-{
-    retry_doubt(r);
-    while (r->inflight_count)
-        inflight_give_up(r);
-    for (; r->command_count; r->command_count--) {
-        relay_emit(r, EVENT_TIMEOUT, r->commands[r->command_head].token, NULL, 0);
-        r->command_head = (r->command_head + 1) % COMMANDS_MAX;
-    }
-    out_cut(r);
-    r->resyncing = r->silent = r->polling = r->polled = r->checking = r->doubtful = false;
-    r->poll.length = 0;
-    r->retry_delay_ns = RETRY_FIRST_NS;
-    r->retry_at_ns = 0;
-    r->refused_ns = NEVER;
-    flow_reset(r);
-}
-
-uint32_t transmit_queued(const struct relay *r)
-{
-    uint32_t n = r->queue_count + r->retry_count + r->flow.sent_count;
-    for (uint32_t i = 0; i < r->inflight_count; i++)
-        n += r->inflight[(r->inflight_head + i) % INFLIGHT_MAX].kind == INFLIGHT_FRAME;
-    return n;
-}
-
-bool transmit_command(struct relay *r, const struct command *command)
-{
-    if (r->command_count == COMMANDS_MAX)
-        return false;
-    r->commands[(r->command_head + r->command_count++) % COMMANDS_MAX] = *command;
-    return true;
+    t->counters = line->counters;
+    t->events = line->events;
+    t->queue = queue;
+    t->line = line;
+    t->ack = ack;
+    t->level = level;
+    t->answers_each = line->codec->confirms == CONFIRMS_EACH;
 }
 
 /* --- answers --------------------------------------------------------------------------------- */
 
-static void frame_confirmed(struct relay *r, uint64_t number)
+static void poll_answered(struct transmit *t, int64_t now)
 {
-    r->count.confirmed++;
-    r->retry_delay_ns = RETRY_FIRST_NS;
-    r->refused_ns = NEVER;
-    while (r->retry_count && retry_first(r)->number < number) {
-        retry_pop(r);
-        queue_drop(r, TX_OVERTAKEN);
-    }
+    bool had_frames = t->counters->decoded != t->poll_decoded;
+    t->polling = false;
+    t->poll_at_ns = had_frames ? now : now + t->poll_interval_ns;
 }
 
-/* Where the device's buffer is full and takes nothing for so long, nothing has left it either. */
-static void look_if_stuck(struct relay *r, int64_t now)
+/* The device answered the oldest in flight. `how`: EVENT_OK, EVENT_REFUSED or EVENT_TEXT. */
+static void oldest_answered(struct transmit *t, enum event_kind how, const struct codec_message *msg, int64_t now)
 {
-    if (r->refused_ns == NEVER)
-        r->refused_ns = now;
-    if (now - r->refused_ns < stuck_ns(r))
-        return;
-    r->refused_ns = now;
-    relay_emit(r, EVENT_STUCK, 0, NULL, 0);
-}
-
-/* BELL says that the adapter did not take the frame: sending it again cannot double it. But a BELL may
- * be noise, or a second answer to the frame before (slcanpty); so first the sync command goes, and if the
- * frame's own answer comes before that command's, the frame was taken after all. Where there was noise
- * that answer may be in it, so that nothing is certain. While the line is being resynchronised BELL may mean something else (the sync command spliced to a broken
- * one), and a frame sent twice is worse than one dropped and counted. */
-static void frame_refused(struct relay *r, const struct tx_frame *tx, uint64_t noise, int64_t now)
-{
-    if (r->resyncing || line_noise(r) != noise) {
-        queue_drop(r, TX_UNANSWERED);
-        return;
-    }
-    if (r->gate != GATE_OPEN) {
-        queue_drop(r, r->gate == GATE_STOPPED ? TX_STOPPED : TX_REFUSED);
-        return;
-    }
-    if (r->retry_delay_ns == RETRY_FIRST_NS || r->count.retries % RETRIES_TOLD == 0)
-        relay_emit(r, EVENT_FRAME_REFUSED, (uint32_t)r->count.retries, NULL, 0);
-    look_if_stuck(r, now);
-    queue_retry(r, tx);
-    if (!r->checking)
-        r->check_noise = line_noise(r);
-    r->checking = true;
-    r->retry_at_ns = now + r->retry_delay_ns;
-    r->retry_delay_ns *= r->retry_delay_ns < RETRY_LAST_NS ? 2 : 1;
-}
-
-static void poll_done(struct relay *r, int64_t now)
-{
-    r->polling = false;
-    r->poll_at_ns = r->count.decoded != r->poll_decoded ? now : now + r->poll_interval_ns;
-}
-
-/* Takes the oldest command out of flight and says what became of it. */
-static void inflight_settle(struct relay *r, enum event_kind how, const struct codec_message *msg, int64_t now)
-{
-    const struct inflight done = *inflight_at(r, 0);
-    r->inflight_head = (r->inflight_head + 1) % INFLIGHT_MAX;
-    r->inflight_count--;
+    const struct inflight done = line_take(t->line);
 
     switch (done.kind) {
     case INFLIGHT_FRAME:
         if (how == EVENT_REFUSED)
-            frame_refused(r, &done.tx, done.noise, now);
+            ack_window_refused(t->ack, &done, now);
         else
-            frame_confirmed(r, done.tx.number);
+            ack_window_confirmed(t->ack, done.tx.number);
         break;
     case INFLIGHT_COMMAND:
-        r->doubtful = r->doubtful && how != EVENT_TEXT;
-        relay_emit(r, how, done.token, msg->text, msg->length);
+        if (how == EVENT_TEXT)
+            t->line->late_answer_possible = false;
+        events_emit(t->events, how, done.token, msg->text, msg->length);
         break;
     case INFLIGHT_POLL:
-        poll_done(r, now);
+        poll_answered(t, now);
         break;
     case INFLIGHT_LEVEL:
-        flow_answered(r, msg, now);
+        level_window_answered(t->level, msg, now);
         break;
     case INFLIGHT_CHECK:
-        r->checking = false;
-        retry_disbelieve(r);
+        ack_window_check_ended(t->ack);
         break;
     case INFLIGHT_SYNC:
-        r->resyncing = r->checking = false;
+        line_synced(t->line);
+        ack_window_synced(t->ack);
+        break;
+    }
+}
+
+/* The oldest in flight is over without an answer of its own. */
+static void oldest_unanswered(struct transmit *t)
+{
+    const struct inflight lost = line_take(t->line);
+
+    switch (lost.kind) {
+    case INFLIGHT_FRAME:
+        queue_drop(t->queue, TX_UNANSWERED);
+        break;
+    case INFLIGHT_COMMAND:
+        events_emit(t->events, EVENT_TIMEOUT, lost.token, NULL, 0);
+        break;
+    case INFLIGHT_POLL:
+        t->polling = false;
+        break;
+    case INFLIGHT_LEVEL:
+        level_window_unanswered(t->level);
+        break;
+    case INFLIGHT_CHECK:
+    case INFLIGHT_SYNC:
+        ack_window_check_ended(t->ack);
         break;
     }
 }
 
 /* A text answers the oldest command that asked for it; answers to what was sent before are lost. */
-static void answer_text(struct relay *r, const struct codec_message *msg, int64_t now)
+static void answer_text(struct transmit *t, const struct codec_message *msg, int64_t now)
 {
-    for (uint32_t i = 0; i < r->inflight_count; i++) {
-        const struct inflight *in = inflight_at(r, i);
-        if (!in->prefix_length || msg->length < in->prefix_length
-            || memcmp(in->prefix, msg->text, in->prefix_length) != 0)
-            continue;
-        while (i--)
-            inflight_give_up(r);
-        inflight_settle(r, EVENT_TEXT, msg, now);
+    uint32_t before = line_find(t->line, msg);
+    if (before < t->line->inflight_count) {
+        while (before--)
+            oldest_unanswered(t);
+        oldest_answered(t, EVENT_TEXT, msg, now);
         return;
     }
-    if (!r->set.codec->reports)
-        r->count.stray_answers++;
-    relay_emit(r, EVENT_UNASKED, 0, msg->text, msg->length);
+    if (!t->line->codec->reports)
+        t->counters->stray_answers++;
+    events_emit(t->events, EVENT_UNASKED, 0, msg->text, msg->length);
 }
 
-/* Whether "done" can only be the answer to a frame that a BELL seemed to refuse. */
-static bool answers_refused(struct relay *r)
+/* CODEC_OK, CODEC_SENT or CODEC_REFUSED came. */
+static void answer_short(struct transmit *t, enum codec_kind kind, int64_t now)
 {
-    const struct inflight *head = inflight_at(r, 0);
-    bool expected = r->inflight_count && (head->kind == INFLIGHT_FRAME || head->accept & ACCEPT_OK);
-    return r->retry_count && (r->checking || r->resyncing) && !expected;
+    const struct codec_message none = {.kind = kind};
+    const struct inflight *oldest = t->line->inflight_count ? line_at(t->line, 0) : NULL;
+    bool refused = kind == CODEC_REFUSED;
+    bool accepted = oldest && oldest->accept & (refused ? ACCEPT_REFUSED : ACCEPT_OK);
+
+    if (!refused && !accepted && ack_window_take_late(t->ack))
+        return;
+    if (!accepted || (kind == CODEC_SENT && oldest->kind != INFLIGHT_FRAME)) {
+        t->counters->stray_answers++;
+        return;
+    }
+    oldest_answered(t, refused ? EVENT_REFUSED : EVENT_OK, &none, now);
 }
 
 /* Anything but a received frame or noise came from the device; `frame` is that of CODEC_RETURNED. */
-void transmit_answer(struct relay *r, const struct codec_message *msg, const struct can_frame *frame, int64_t now)
+void transmit_answer(struct transmit *t, const struct codec_message *msg, const struct can_frame *frame, int64_t now)
 {
-    if (msg->kind == CODEC_TEXT) {
-        answer_text(r, msg, now);
-        return;
-    }
-    if (msg->kind == CODEC_STOP || msg->kind == CODEC_GO || msg->kind == CODEC_RETURNED) {
-        flow_message(r, msg->kind, frame, now);
-        return;
-    }
-    const struct codec_message none = {.kind = msg->kind};
-    const struct inflight *head = inflight_at(r, 0);
-    bool refused = msg->kind == CODEC_REFUSED;
-    uint8_t needed = refused ? ACCEPT_REFUSED : ACCEPT_OK;
+    if (msg->kind == CODEC_TEXT)
+        answer_text(t, msg, now);
+    else if (msg->kind == CODEC_STOP || msg->kind == CODEC_GO || msg->kind == CODEC_RETURNED)
+        level_window_message(t->level, msg->kind, frame, now);
+    else
+        answer_short(t, msg->kind, now);
+}
 
-    if (!refused && answers_refused(r)) {
-        frame_confirmed(r, retry_pop(r).number);
-        return;
+/* --- a port comes or goes -------------------------------------------------------------------- */
+
+static void answer_missing(struct transmit *t)
+{
+    if (t->answers_each)
+        ack_window_answer_missing(t->ack);
+}
+
+/* The port is gone or new: what was in flight will never be answered. */
+void transmit_reset(struct transmit *t)
+{
+    answer_missing(t);
+    while (t->line->inflight_count)
+        oldest_unanswered(t);
+    for (; t->command_count; t->command_count--) {
+        events_emit(t->events, EVENT_TIMEOUT, t->commands[t->command_head].token, NULL, 0);
+        t->command_head = (t->command_head + 1) % COMMANDS_MAX;
     }
-    if (!r->inflight_count || !(head->accept & needed)
-        || (msg->kind == CODEC_SENT && head->kind != INFLIGHT_FRAME)) {
-        r->count.stray_answers++;
-        return;
+    t->polling = t->polled = false;
+    t->poll.length = 0;
+    line_reset(t->line);
+    ack_window_reset(t->ack);
+    level_window_reset(t->level);
+}
+
+/* The port is new, or that of a device whose cut is not to be finished. */
+void transmit_forget(struct transmit *t)
+{
+    line_forget(t->line);
+    level_window_forget(t->level);
+}
+
+/* Says this at once, but behind the message that the port took in part. Nothing that waited is sent any more.
+ * -> 0, or errno of a port that is gone */
+int transmit_last_words(struct transmit *t, int port, const uint8_t *words, size_t length)
+{
+    transmit_reset(t);
+    return port >= 0 && line_say(t->line, words, length) ? line_flush(t->line, port) : 0;
+}
+
+/* -> false: more commands wait than can ever be meant */
+bool transmit_command(struct transmit *t, const struct command *command)
+{
+    if (t->command_count == COMMANDS_MAX)
+        return false;
+    t->commands[(t->command_head + t->command_count++) % COMMANDS_MAX] = *command;
+    return true;
+}
+
+void transmit_poll(struct transmit *t, const struct command *poll, int64_t interval_ns)
+{
+    t->poll = *poll;
+    t->poll_interval_ns = interval_ns;
+    t->poll_at_ns = 0;
+}
+
+/* --- missing answers ------------------------------------------------------------------------- */
+
+static int resync(struct transmit *t, int64_t now)
+{
+    answer_missing(t);
+    return line_resync(t->line, now);
+}
+
+static int resync_again(struct transmit *t, int64_t now)
+{
+    int error = line_sync_again(t->line, now);
+    if (error != ENODATA)
+        return error;
+    while (t->line->inflight_count)
+        oldest_unanswered(t);
+    line_fall_silent(t->line);
+    return 0;
+}
+
+/* Whether the oldest in flight may still be answered late, so that its place is kept: a frame, or the question
+ * behind frames. */
+static bool keeps_its_place(const struct inflight *oldest, bool live)
+{
+    return oldest->kind == INFLIGHT_FRAME || (oldest->kind == INFLIGHT_LEVEL && live);
+}
+
+/* -> 0, or errno of a port that is gone */
+static int look_for_missing(struct transmit *t, int64_t now)
+{
+    struct line *l = t->line;
+    bool live = t->queue->gate == GATE_OPEN || t->queue->gate == GATE_LISTEN_ONLY;
+
+    if (l->resyncing)
+        return line_at(l, l->inflight_count - 1)->deadline_ns <= now ? resync_again(t, now) : 0;
+    while (l->inflight_count && line_at(l, 0)->deadline_ns <= now) {
+        bool kept = keeps_its_place(line_at(l, 0), live);
+        if (!kept)
+            oldest_unanswered(t);
+        if (kept || live)
+            return resync(t, now);
+        l->late_answer_possible = true;
     }
-    inflight_settle(r, refused ? EVENT_REFUSED : EVENT_OK, &none, now);
+    if (l->late_answer_possible && t->queue->gate == GATE_OPEN && !l->inflight_count)
+        return resync(t, now);
+    return 0;
 }
 
 /* --- sending --------------------------------------------------------------------------------- */
 
-static struct inflight *inflight_push(struct relay *r, enum inflight_kind kind, int64_t deadline_ns)
+static bool frame_ready(const struct transmit *t, int64_t now)
 {
-    struct inflight *in = inflight_at(r, r->inflight_count++);
-    *in = (struct inflight){.kind = kind, .deadline_ns = deadline_ns, .noise = line_noise(r)};
-    return in;
+    if (t->line->silent || !queue_waiting(t->queue))
+        return false;
+    return t->answers_each ? ack_window_open(t->ack, now) : level_window_open(t->level);
 }
 
-static void send_command(struct relay *r, const struct command *c, enum inflight_kind kind, int64_t now)
+static void send_frame(struct transmit *t, int64_t now)
 {
-    int64_t timeout = c->timeout_ns ? c->timeout_ns : r->set.answer_timeout_ns;
-    struct inflight *in = inflight_push(r, kind, now + timeout);
-    if (now + timeout < r->out_until_ns)
-        r->out_until_ns = now + timeout;
-    in->token = c->token;
-    in->accept = c->accept;
-    in->prefix_length = c->prefix_length;
-    memcpy(in->prefix, c->prefix, sizeof in->prefix);
-    memcpy(r->out + r->out_end, c->data, c->length);
-    r->out_end += c->length;
-}
+    struct queue *q = t->queue;
+    bool again = q->retry_count > 0;
+    const struct tx_frame tx = again ? queue_retry_pop(q) : queue_pop(q);
 
-static void send_frame(struct relay *r, const struct tx_frame *tx, int64_t now)
-{
-    size_t n = r->set.codec->encode(&tx->frame, r->out + r->out_end);
-    if (!n) {
-        queue_drop(r, TX_MALFORMED);
+    t->polled = false;
+    if (queue_expired(q, &tx, now)) { /* it stood behind a younger one, where queue_expire() does not look */
+        queue_drop(q, again ? TX_REFUSED : TX_STALE);
         return;
     }
-    if (flow_used(r)) {
-        flow_sent(r, tx);
-    } else {
-        struct inflight *in = inflight_push(r, INFLIGHT_FRAME, now + r->set.answer_timeout_ns);
-        in->accept = ACCEPT_OK | ACCEPT_REFUSED;
-        in->tx = *tx;
-    }
-    if (tx->born_ns + r->set.deadline_ns + 1 < r->out_until_ns)
-        r->out_until_ns = tx->born_ns + r->set.deadline_ns + 1;
-    r->out_end += n;
+    t->counters->retries += again;
+    if (!line_send_frame(t->line, &tx, q->set.deadline_ns, now))
+        queue_drop(q, TX_MALFORMED);
+    else if (!t->answers_each)
+        level_window_sent(t->level, &tx);
 }
 
-/* The only command that does not wait for room in the window, so it looks for room in `out` itself. */
-static void send_sync(struct relay *r, int64_t now)
+/* A poll is due. After one a frame goes first: a busy bus must not keep frames from going. */
+static bool poll_due(const struct transmit *t, bool receiving, bool frame, int64_t now)
 {
-    if (r->out_end + COMMAND_SIZE > OUT_BUFFER)
-        relay_port_lost(r, ETIME);
-    else
-        send_command(r, &r->set.sync, INFLIGHT_SYNC, now);
-}
-
-/* An answer is missing. Nothing more is sent until the adapter has answered a command whose answer
- * cannot be taken for any other: what came before it then belongs to the past. */
-static void resync_start(struct relay *r, int64_t now)
-{
-    retry_doubt(r);
-    r->resyncing = true;
-    r->doubtful = false;
-    r->sync_tries = 1;
-    r->count.resyncs++;
-    relay_emit(r, EVENT_UNANSWERED, (uint32_t)r->count.resyncs, NULL, 0);
-    send_sync(r, now);
-}
-
-static void resync_again(struct relay *r, int64_t now)
-{
-    r->inflight_count--; /* the sync command is always the last in flight */
-    if (r->sync_tries++ < SYNC_TRIES) {
-        send_sync(r, now);
-        return;
-    }
-    while (r->inflight_count)
-        inflight_give_up(r);
-    r->resyncing = false;
-    r->silent = true;
-    relay_emit(r, EVENT_SILENT, 0, NULL, 0);
-}
-
-static void check_answers(struct relay *r, int64_t now)
-{
-    if (r->resyncing) {
-        if (inflight_at(r, r->inflight_count - 1)->deadline_ns <= now)
-            resync_again(r, now);
-        return;
-    }
-    while (r->inflight_count && inflight_at(r, 0)->deadline_ns <= now) {
-        enum inflight_kind kind = inflight_at(r, 0)->kind;
-        bool live = r->gate == GATE_OPEN || r->gate == GATE_LISTEN_ONLY;
-        bool frame = kind == INFLIGHT_FRAME || (kind == INFLIGHT_LEVEL && live);
-        if (!frame) /* a frame keeps its place: its answer may only be late */
-            inflight_give_up(r);
-        if (frame || live) {
-            resync_start(r, now);
-            return;
-        }
-        r->doubtful = true;
-    }
-    if (r->doubtful && r->gate == GATE_OPEN && !r->inflight_count)
-        resync_start(r, now);
-}
-
-/* Whether a frame may go now. After a refusal one at a time, so that none overtakes another. */
-static bool frame_ready(const struct relay *r, int64_t now)
-{
-    if (!queue_waiting(r))
+    if (!t->poll.length || !receiving || t->polling || t->line->silent || now < t->poll_at_ns)
         return false;
-    if (flow_used(r))
-        return flow_ready(r);
-    if (r->retry_count)
-        return !r->inflight_count && now >= r->retry_at_ns;
-    return true;
+    return !(t->polled && frame);
 }
 
-static bool send_next(struct relay *r, int64_t now)
+/* -> whether more may go now */
+static bool send_next(struct transmit *t, bool receiving, int64_t now)
 {
-    if (r->resyncing || r->inflight_count >= r->set.window)
+    if (!line_has_room(t->line) || !line_window_open(t->line))
         return false;
-    if (r->checking) {
-        if (!r->inflight_count)
-            send_command(r, &r->set.sync, INFLIGHT_CHECK, now);
+    if (t->ack->checking) {
+        if (!t->line->inflight_count)
+            line_send_command(t->line, &t->line->sync, INFLIGHT_CHECK, now);
         return false;
     }
-    if (flow_ask_due(r, frame_ready(r, now) && !r->command_count, now)) {
-        flow_asked(r, now);
-        send_command(r, &r->flow.ask, INFLIGHT_LEVEL, now);
+    bool frame = frame_ready(t, now);
+    if (!t->answers_each && level_window_ask_due(t->level, frame && !t->command_count, now)) {
+        level_window_ask(t->level, now);
         return true;
     }
-    if (r->command_count) {
-        send_command(r, &r->commands[r->command_head], INFLIGHT_COMMAND, now);
-        r->command_head = (r->command_head + 1) % COMMANDS_MAX;
-        r->command_count--;
+    if (t->command_count) {
+        line_send_command(t->line, &t->commands[t->command_head], INFLIGHT_COMMAND, now);
+        t->command_head = (t->command_head + 1) % COMMANDS_MAX;
+        t->command_count--;
         return true;
     }
-    bool turn_of_frame = r->polled && frame_ready(r, now); /* a busy bus must not keep frames from going */
-    if (r->poll.length && r->receiving && !r->polling && !r->silent && now >= r->poll_at_ns && !turn_of_frame) {
-        r->polling = r->polled = true;
-        r->poll_decoded = r->count.decoded;
-        send_command(r, &r->poll, INFLIGHT_POLL, now);
+    if (poll_due(t, receiving, frame, now)) {
+        t->polling = t->polled = true;
+        t->poll_decoded = t->counters->decoded;
+        line_send_command(t->line, &t->poll, INFLIGHT_POLL, now);
         return true;
     }
-    if (!frame_ready(r, now))
-        return false;
-    r->polled = false;
-    bool again = r->retry_count > 0;
-    struct tx_frame tx = again ? retry_pop(r) : queue_pop(r);
-    if (now - tx.born_ns > r->set.deadline_ns) { /* it stood behind a younger one, where queue_expire() does not look */
-        queue_drop(r, again ? TX_REFUSED : TX_STALE);
-        return true;
-    }
-    r->count.retries += again;
-    send_frame(r, &tx, now);
-    return true;
-}
-
-/* EINTR: again. EAGAIN: when poll says so. Anything else: the port is gone. */
-static void out_flush(struct relay *r)
-{
-    while (r->out_start < r->out_end) {
-        ssize_t n = write(r->port, r->out + r->out_start, r->out_end - r->out_start);
-        if (n < 0 && errno == EINTR)
-            continue;
-        if (n < 0 && errno != EAGAIN) {
-            relay_port_lost(r, errno);
-            return;
-        }
-        if (n <= 0)
-            return;
-        r->out_start += (size_t)n;
-    }
-    r->out_start = r->out_end = 0;
-    r->out_until_ns = NEVER;
-}
-
-/* Says this at once, but behind the message that the port took in part. Nothing that waited is sent any more. */
-void transmit_last_words(struct relay *r, const uint8_t *words, size_t length)
-{
-    transmit_reset(r);
-    if (r->port < 0 || length > OUT_BUFFER - r->out_end)
-        return;
-    memcpy(r->out + r->out_end, words, length);
-    r->out_end += length;
-    out_flush(r);
+    if (frame)
+        send_frame(t, now);
+    return frame;
 }
 
 /* Nothing waits, nothing is in flight, nothing is in the device's buffer: transmit_pump and transmit_deadline
  * have nothing to look at. */
-bool transmit_idle(const struct relay *r)
+bool transmit_idle(const struct transmit *t)
 {
-    bool owed = r->queue_count || r->retry_count || r->command_count || r->inflight_count || r->out_end;
-    bool taken = r->flow.sent_count || r->flow.level;
-    return !owed && !taken && !r->poll.length && !r->doubtful && !r->checking && !r->resyncing;
+    const struct line *l = t->line;
+    bool waiting = t->queue->waiting_count || t->queue->retry_count || t->command_count;
+    bool owed = l->inflight_count || l->out_end || l->late_answer_possible || t->ack->checking || l->resyncing;
+    bool taken = t->level->sent_count || t->level->level;
+    return !waiting && !owed && !taken && !t->poll.length;
 }
 
-/* Sends what the window allows, in one write. */
-void transmit_pump(struct relay *r, int64_t now)
+/* Sends what the window allows, in one write. `receiving`: the device may be asked for frames.
+ * -> 0, or errno of a port that is gone; ETIME: the port takes nothing, what waits in `out` must not go out late */
+int transmit_pump(struct transmit *t, int port, bool receiving, int64_t now)
 {
-    if (r->port < 0) {
-        queue_expire(r, now);
-        return;
+    struct line *l = t->line;
+    if (now >= l->out_until_ns)
+        return ETIME;
+    int error = look_for_missing(t, now);
+    if (!error && l->out_start) { /* a message the port took in part is finished first */
+        line_finish(l, now);
+        error = line_flush(l, port);
     }
-    if (now >= r->out_until_ns) { /* the port takes nothing: what waits here must not go out late */
-        relay_port_lost(r, ETIME);
-        return;
-    }
-    check_answers(r, now);
-    if (r->port < 0)
-        return;
-    if (r->out_start) { /* a message the port took in part is finished first */
-        if (r->out_until_ns == NEVER) /* begun before this port was attached */
-            r->out_until_ns = now + r->set.answer_timeout_ns;
-        out_flush(r);
-    }
-    if (r->out_start || r->port < 0)
-        return;
-    queue_expire(r, now);
-    while (r->out_end + COMMAND_SIZE <= OUT_BUFFER && send_next(r, now)) /* a command or a frame */
+    if (error || l->out_start)
+        return error;
+    /* where each frame is answered, nobody knows before a refusal was checked what became of the frame */
+    queue_expire(t->queue, !t->answers_each || !(t->ack->checking || l->resyncing), now);
+    while (send_next(t, receiving, now))
         ;
-    out_flush(r);
+    return line_flush(l, port);
 }
 
 /* When transmit_pump has something to do without any input. */
-int64_t transmit_deadline(struct relay *r)
+int64_t transmit_deadline(const struct transmit *t, bool receiving)
 {
-    int64_t at = NEVER;
-    if (r->port < 0)
-        return queue_expires_ns(r);
-    if (r->inflight_count) {
-        uint32_t i = r->resyncing ? r->inflight_count - 1 : 0;
-        at = r->inflight[(r->inflight_head + i) % INFLIGHT_MAX].deadline_ns;
-    }
-    if (r->out_until_ns < at)
-        at = r->out_until_ns;
-    if (r->resyncing || r->silent || r->checking || r->out_start || r->inflight_count >= r->set.window)
+    const struct line *l = t->line;
+    int64_t at = line_deadline(l);
+    if (l->silent || t->ack->checking || l->out_start || !line_window_open(l))
         return at;
-    if (r->poll.length && r->receiving && !r->polling && r->poll_at_ns < at)
-        at = r->poll_at_ns;
-    if (flow_used(r)) {
-        int64_t ask_at = flow_deadline(r);
-        return ask_at < at ? ask_at : at;
-    }
-    if (r->retry_count && r->gate == GATE_OPEN && !r->inflight_count && r->retry_at_ns < at)
-        at = r->retry_at_ns;
-    return at;
+    if (t->poll.length && receiving && !t->polling && t->poll_at_ns < at)
+        at = t->poll_at_ns;
+    int64_t frame_at = t->answers_each ? ack_window_deadline(t->ack) : level_window_deadline(t->level);
+    return frame_at < at ? frame_at : at;
+}
+
+/* Frames read from the interface of which nobody knows yet what becomes of them. */
+uint32_t transmit_queued(const struct transmit *t)
+{
+    uint32_t n = t->queue->waiting_count + t->queue->retry_count + t->level->sent_count;
+    for (uint32_t i = 0; i < t->line->inflight_count; i++)
+        n += line_at(t->line, i)->kind == INFLIGHT_FRAME;
+    return n;
 }

@@ -132,7 +132,8 @@ static inline const char *transcript_step(struct transcript *transcript, const s
         return "wrote a frame without CODEC_FRAME or CODEC_RETURNED";
     if (*taken == 0)
         return NULL;
-    if (msg.kind == CODEC_TEXT && msg.text >= state->usb2can.spliced && msg.text < state->usb2can.spliced + sizeof state->usb2can.spliced)
+    const uint8_t *spliced = state->usb2can.spliced;
+    if (msg.kind == CODEC_TEXT && msg.text >= spliced && msg.text < spliced + sizeof state->usb2can.spliced)
         return transcript_add_spliced(transcript, &msg, bytes, done, done + *taken);
     return transcript_add(transcript, &msg, &frame, in, done, *taken);
 }

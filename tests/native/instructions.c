@@ -6,6 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 enum { FRAMES = 64, ROUNDS = 50, WIRE = 64 * FRAMES, WINDOW_CAN232 = 32, WINDOW_USB2CAN = 16 };
@@ -90,14 +91,20 @@ static void turn(void)
     relay_turn(relay, (struct moment){now, now});
 }
 
+static struct counters counted(void)
+{
+    struct snapshot s;
+    relay_snapshot(relay, &s);
+    return s.counters;
+}
+
 static void relay_start(const struct codec *codec)
 {
     static const struct command sync = {.prefix = "V", .prefix_length = 1, .data = "V\r", .length = 2};
     const struct settings set = {
         .codec = codec,
-        .queue = 1024,
-        .window = codec->level ? WINDOW_USB2CAN : WINDOW_CAN232,
-        .deadline_ns = NS_PER_S,
+        .queue = {.size = 1024, .deadline_ns = NS_PER_S, .stuck_ns = NS_PER_S},
+        .window = codec->confirms == CONFIRMS_LEVEL ? WINDOW_USB2CAN : WINDOW_CAN232,
         .answer_timeout_ns = NS_PER_S,
         .sync = sync,
     };
@@ -107,33 +114,31 @@ static void relay_start(const struct codec *codec)
              && !socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_NONBLOCK, 0, buses), "no relay");
     port = ports[1];
     bus = buses[1];
-    pthread_mutex_lock(&relay->lock);
-    relay_attach_port(relay, ports[0]);
-    relay_attach_bus(relay, buses[0]);
-    relay->receiving = true;
-    queue_set_gate(relay, GATE_OPEN);
-    if (!codec->level)
+    must(!relay_attach_port(relay, ports[0]) && !relay_attach_interface(relay, buses[0]), "nothing attached");
+    relay_set_gates(relay, true, GATE_OPEN);
+    if (codec->confirms != CONFIRMS_LEVEL)
         return;
     /* GET and its answer: limits 15 and 7, both buffers empty */
-    static const struct flow flow = {
+    static const struct level_settings level = {
         .ask = {.prefix = {32}, .prefix_length = 1, .data = {0x0F, 32, 1, 2}, .length = 4},
         .capacity = 18, .critical = 15, .ready = 7,
     };
-    flow_start(relay, &flow);
+    relay_set_level_window(relay, &level);
 }
 
 /* What the relay has sent: commands and frames, CAN232's end with CR; returns whether it was anything. */
 static bool answer(const struct codec *codec)
 {
     static const uint8_t level[] = {0x0F, 32, 4, 15, 7, 0, 0};
-    uint8_t in[OUT_BUFFER];
+    bool asks = codec->confirms == CONFIRMS_LEVEL;
+    uint8_t in[WIRE];
     ssize_t n = read(port, in, sizeof in);
     if (n <= 0)
         return false;
-    for (ssize_t i = 0; i < n && !codec->level; i++)
+    for (ssize_t i = 0; i < n && !asks; i++)
         if (in[i] == '\r')
             must(write(port, "z\r", 2) == 2, "no answer");
-    if (codec->level)
+    if (asks)
         must(write(port, level, sizeof level) == sizeof level, "no answer");
     return true;
 }
@@ -145,7 +150,7 @@ static void to_device(const struct codec *codec)
     do
         turn();
     while (answer(codec));
-    moved = relay->count.confirmed;
+    moved = counted().confirmed;
 }
 
 static void to_bus(const struct codec *codec)
@@ -158,7 +163,7 @@ static void to_bus(const struct codec *codec)
         must(read(bus, &frame, sizeof frame) == sizeof frame, "frames are missing");
         must(memcmp(&frame, &frames[i], sizeof frame) == 0, "another frame");
     }
-    moved = relay->count.delivered;
+    moved = counted().delivered;
 }
 
 int main(int argc, char **argv)

@@ -1,7 +1,7 @@
 /* What the relay does with a message of which the port took a part only, cut at every byte.
  * write() is replaced (-Wl,--wrap): no port of a test machine is full at a byte of one's choice. */
 #include "check.h"
-#include "../../bridged/relay/relay.h"
+#include "../../bridged/relay/relay.c" /* to know its descriptor of the port, and to set the window's room */
 
 #include <errno.h>
 #include <string.h>
@@ -52,11 +52,12 @@ struct bench {
 
 static void bench_attach(struct bench *b)
 {
-    static const struct flow flow = {.capacity = 18, .critical = 15, .ready = 7, .ask = {.length = 3, .data = {0x0F, 0x06, 0}}};
+    static const struct level_settings level = {
+        .capacity = 18, .critical = 15, .ready = 7, .ask = {.length = 3, .data = {0x0F, 0x06, 0}}};
     relay_attach_port(b->relay, b->near[0]);
-    if (b->kind->codec->level) {
-        flow_start(b->relay, &flow);
-        b->relay->flow.room = FRAMES;
+    if (b->kind->codec->confirms == CONFIRMS_LEVEL) {
+        relay_set_level_window(b->relay, &level);
+        b->relay->level.room = FRAMES;
     }
     port_fd = b->relay->port;
 }
@@ -65,8 +66,8 @@ static void bench_attach(struct bench *b)
 static struct bench bench_new(const struct kind *kind, size_t taken)
 {
     struct settings set = {
-        .codec = kind->codec, .queue = 16, .window = 16, .deadline_ns = DEADLINE_NS, .answer_timeout_ns = NS_PER_S / 4,
-        .sync = {.length = 2}};
+        .codec = kind->codec, .window = 16, .answer_timeout_ns = NS_PER_S / 4, .sync = {.length = 2},
+        .queue = {.size = 16, .deadline_ns = DEADLINE_NS, .stuck_ns = NS_PER_S}};
     int port[2], interface[2];
     memcpy(set.sync.data, kind->sync, 2);
     struct bench b = {.relay = relay_new(&set), .kind = kind, .now = NS_PER_S};
@@ -77,10 +78,9 @@ static struct bench bench_new(const struct kind *kind, size_t taken)
         b.near[i] = i ? interface[0] : port[0];
         b.far[i] = i ? interface[1] : port[1];
     }
-    pthread_mutex_lock(&b.relay->lock);
     bench_attach(&b);
-    relay_attach_bus(b.relay, b.near[1]);
-    b.relay->gate = GATE_OPEN;
+    relay_attach_interface(b.relay, b.near[1]);
+    relay_set_gates(b.relay, false, GATE_OPEN);
     room = taken;
     wire_length = 0;
     for (unsigned i = 0; i < FRAMES; i++) {
@@ -98,8 +98,7 @@ static struct bench bench_new(const struct kind *kind, size_t taken)
 static void bench_free(struct bench *b)
 {
     relay_detach_port(b->relay);
-    relay_detach_bus(b->relay);
-    pthread_mutex_unlock(&b->relay->lock);
+    relay_detach_interface(b->relay);
     relay_free(b->relay);
     for (int i = 0; i < 2; i++) {
         close(b->near[i]);
@@ -152,9 +151,11 @@ static bool bench_lost(struct bench *b)
 
 static uint64_t frames_counted(const struct bench *b)
 {
-    uint64_t n = transmit_queued(b->relay) + b->relay->count.confirmed;
+    struct snapshot s;
+    relay_snapshot(b->relay, &s);
+    uint64_t n = s.queued + s.counters.confirmed;
     for (unsigned i = 0; i < TX_DROPS; i++)
-        n += b->relay->count.tx_dropped[i];
+        n += s.counters.tx_dropped[i];
     return n;
 }
 
@@ -167,11 +168,11 @@ static void test_resumed(const struct kind *kind, size_t taken, size_t more)
     relay_turn(b.relay, (struct moment){b.now, b.now});
     CHECK(bench_lost(&b));
     for (int i = 0; i < 2; i++) {
-        struct cut cut = transmit_cut(b.relay);
+        struct cut cut = relay_cut(b.relay);
         CHECK(!cut.length || (cut.taken > 0 && cut.taken < cut.length));
         bench_attach(&b);
-        transmit_resume(b.relay, &cut);
-        transmit_command(b.relay, &command);
+        relay_resume(b.relay, &cut);
+        relay_command(b.relay, &command, false);
         room = i ? 0 : more;
         b.now += 1000;
         relay_turn(b.relay, (struct moment){b.now, b.now});
@@ -186,7 +187,7 @@ static void test_resumed(const struct kind *kind, size_t taken, size_t more)
     CHECK(wire_is_clean(&b, &command));
     CHECK(!memcmp(wire + wire_length - 4, command.data, 4));
     CHECK(frames_counted(&b) == FRAMES);
-    CHECK(b.relay->count.tx_dropped[TX_UNANSWERED] == FRAMES);
+    CHECK(b.relay->counters.tx_dropped[TX_UNANSWERED] == FRAMES);
     bench_free(&b);
 }
 
@@ -200,7 +201,7 @@ static void test_forgotten(const struct kind *kind, size_t taken)
     wire_length = 0;
     bench_drain(&b);
     CHECK(wire_length == 0);
-    CHECK(transmit_cut(b.relay).length == 0);
+    CHECK(relay_cut(b.relay).length == 0);
     bench_free(&b);
 }
 
@@ -212,7 +213,7 @@ static void test_last_words(const struct kind *kind, size_t taken, bool late)
     for (; begun < FRAMES && at < taken; begun++)
         at += b.lengths[begun];
     room = late ? 0 : sizeof wire - wire_length;
-    transmit_last_words(b.relay, (const uint8_t *)kind->words, kind->words_length);
+    relay_last_words(b.relay, (const uint8_t *)kind->words, kind->words_length);
     bench_drain(&b);
     CHECK(wire_is(&b, kind->words, kind->words_length));
     CHECK(wire_length == at + kind->words_length);

@@ -5,6 +5,7 @@
 
 #include <errno.h>
 #include <string.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 static int next_error;  /* that the next call ends with; 0: it is done by the kernel */
@@ -45,8 +46,8 @@ static struct bench bench_new(void)
 {
     static const struct command sync = {.prefix = "V", .prefix_length = 1, .data = "V\r", .length = 2};
     const struct settings set = {
-        .codec = &codec_can232, .queue = 16, .window = 1, .deadline_ns = NS_PER_S, .answer_timeout_ns = NS_PER_S,
-        .sync = sync};
+        .codec = &codec_can232, .window = 1, .answer_timeout_ns = NS_PER_S, .sync = sync,
+        .queue = {.size = 16, .deadline_ns = NS_PER_S, .stuck_ns = NS_PER_S}};
     int port[2], interface[2];
     struct bench b = {.relay = relay_new(&set), .now = NS_PER_S};
     if (!b.relay || socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK, 0, port)
@@ -56,18 +57,14 @@ static struct bench bench_new(void)
     b.interface = interface[1];
     b.near[0] = port[0];
     b.near[1] = interface[0];
-    pthread_mutex_lock(&b.relay->lock);
     relay_attach_port(b.relay, port[0]);
-    relay_attach_bus(b.relay, interface[0]);
-    b.relay->receiving = true;
+    relay_attach_interface(b.relay, interface[0]);
+    relay_set_gates(b.relay, true, GATE_AWAY);
     return b;
 }
 
 static void bench_free(struct bench *b)
 {
-    relay_detach_port(b->relay);
-    relay_detach_bus(b->relay);
-    pthread_mutex_unlock(&b->relay->lock);
     relay_free(b->relay);
     close(b->port);
     close(b->interface);
@@ -99,10 +96,19 @@ static unsigned bench_delivered(struct bench *b)
 
 static bool bench_told(struct bench *b, enum event_kind kind)
 {
-    for (uint32_t i = 0; i < b->relay->event_count; i++)
-        if (b->relay->events[(b->relay->event_head + i) % EVENTS_MAX].kind == kind)
+    struct event events[EVENTS_MAX];
+    uint32_t n = relay_take_events(b->relay, events, EVENTS_MAX);
+    for (uint32_t i = 0; i < n; i++)
+        if (events[i].kind == kind)
             return true;
     return false;
+}
+
+static struct snapshot bench_counted(struct bench *b)
+{
+    struct snapshot s;
+    relay_snapshot(b->relay, &s);
+    return s;
 }
 
 /* A call that a signal broke off is made again. */
@@ -111,7 +117,7 @@ static void test_interrupted(unsigned frames)
     struct bench b = bench_new();
     bench_receive(&b, frames, EINTR, 3);
     CHECK(bench_delivered(&b) == frames);
-    CHECK(b.relay->count.delivered == frames);
+    CHECK(bench_counted(&b).counters.delivered == frames);
     bench_free(&b);
 }
 
@@ -121,11 +127,11 @@ static void test_full(unsigned frames, int error)
     struct bench b = bench_new();
     bench_receive(&b, frames, error, 1);
     CHECK(bench_delivered(&b) == 0);
-    CHECK(b.relay->rx_count == frames);
+    CHECK(bench_counted(&b).pending == frames);
     b.now += NS_PER_S / 100;
     relay_turn(b.relay, (struct moment){b.now, b.now});
     CHECK(bench_delivered(&b) == frames);
-    CHECK(b.relay->count.rx_dropped[RX_BUS_FULL] == 0);
+    CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_FULL] == 0);
     bench_free(&b);
 }
 
@@ -134,8 +140,8 @@ static void test_down(unsigned frames)
 {
     struct bench b = bench_new();
     bench_receive(&b, frames, ENETDOWN, 1);
-    CHECK(b.relay->count.rx_dropped[RX_BUS_DOWN] == frames);
-    CHECK(b.relay->rx_count == 0);
+    CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_DOWN] == frames);
+    CHECK(bench_counted(&b).pending == 0);
     CHECK(!bench_told(&b, EVENT_BUS_LOST));
     bench_receive(&b, frames, 0, 0);
     CHECK(bench_delivered(&b) == frames);
@@ -147,10 +153,10 @@ static void test_lost(unsigned frames, int error)
 {
     struct bench b = bench_new();
     bench_receive(&b, frames, error, 1);
-    CHECK(b.relay->count.rx_dropped[RX_BUS_LOST] == frames);
+    CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_LOST] == frames);
     CHECK(bench_told(&b, EVENT_BUS_LOST));
     bench_receive(&b, frames, 0, 0);
-    CHECK(b.relay->count.rx_dropped[RX_BUS_LOST] == 2 * frames);
+    CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_LOST] == 2 * frames);
     CHECK(bench_delivered(&b) == 0);
     bench_free(&b);
 }

@@ -55,6 +55,7 @@ class Rig:
             queue=4096,
             window=window,
             deadline=deadline,
+            stuck=max(deadline, 0.5),
             answer_timeout=self.adapter.answer_timeout_s,
             sync=self.adapter.sync.request,
             sync_prefix=self.adapter.sync.prefix,

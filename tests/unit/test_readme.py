@@ -60,7 +60,7 @@ def test_every_state_is_explained() -> None:
 
 def test_every_reason_is_explained() -> None:
     relay = _relay.Relay(
-        "can232", queue=1, window=1, deadline=1, answer_timeout=1, sync=b"V\r", sync_prefix=b"V"
+        "can232", queue=1, window=1, deadline=1, stuck=1, answer_timeout=1, sync=b"V\r", sync_prefix=b"V"
     )
     reasons = relay.counters()["tx_dropped"]
     assert isinstance(reasons, dict)

@@ -33,13 +33,16 @@ def number_of(line: bytes) -> int:
 class Rig:
     """A relay between two socketpairs; `turn` lets it do what can be done at `now`."""
 
-    def __init__(self, *, queue: int = 16, window: int = 1, deadline: float = 1.0) -> None:
+    def __init__(
+        self, *, queue: int = 16, window: int = 1, deadline: float = 1.0, stuck: float = 1.0
+    ) -> None:
         self.now = 1_000 * MS
         self.relay = _relay.Relay(
             "can232",
             queue=queue,
             window=window,
             deadline=deadline,
+            stuck=stuck,
             answer_timeout=0.3,
             sync=b"V\r",
             sync_prefix=b"V",

@@ -114,6 +114,7 @@ RELAY = {
     "queue": 16,
     "window": 1,
     "deadline": 1.0,
+    "stuck": 1.0,
     "answer_timeout": 0.3,
     "sync": b"V\r",
     "sync_prefix": b"V",
@@ -140,8 +141,9 @@ def command_with(**options: object) -> Callable[[Rig], object]:
         *(relay_with(queue=n) for n in (-1, 0, 65_537, 2**32 - 1, 2**32 + 1, 2**64 + 1)),
         *(relay_with(window=n) for n in (-1, 0, 33, 2**32 + 1, 2**64 + 1)),
         *(relay_with(deadline=s) for s in (-1.0, 0.0, 1e6, 1e300, float("nan"))),
+        *(relay_with(stuck=s) for s in (-1.0, 0.0, 1e6, 1e300, float("nan"))),
         *(relay_with(answer_timeout=s) for s in (-1.0, 0.0, 1e6, 1e300, float("nan"))),
-        *(lambda rig, n=n: rig.relay.set_queue(n, 1.0) for n in (-1, 0, 65_537, 2**32 + 1)),
+        *(lambda rig, n=n: rig.relay.set_queue(n, 1.0, 1.0) for n in (-1, 0, 65_537, 2**32 + 1)),
         *(flow_with(**{name: n}) for name in FLOW for n in (-1, 2**32 + 7, 2**64 + 7)),
         *(command_with(accept=n) for n in (-1, 4, 256, 300, 2**31)),
         *(command_with(token=n) for n in (-1, 2**32, 2**64)),
@@ -157,7 +159,7 @@ def test_numbers_out_of_range_are_refused(rig: Rig, call: Callable[[Rig], object
 def test_the_largest_numbers_are_taken(rig: Rig) -> None:
     with pytest.raises(TypeError):
         relay_with(queue=1.5)(rig)
-    relay_with(queue=65_536, window=32, deadline=999_999.0, answer_timeout=999_999.0)(rig)
+    relay_with(queue=65_536, window=32, deadline=999_999.0, stuck=999_999.0, answer_timeout=999_999.0)(rig)
     command_with(token=2**32 - 1, accept=3)(rig)
     flow_with(capacity=255, critical=255, ready=254)(rig)
 

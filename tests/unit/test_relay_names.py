@@ -26,7 +26,14 @@ def test_each_event_is_a_constant_of_its_own() -> None:
 @pytest.mark.parametrize("kind", ["counters", "tx_dropped", "rx_dropped"])
 def test_each_counter_and_reason_has_a_meaning(kind: str) -> None:
     relay = _relay.Relay(
-        "can232", queue=1, window=1, deadline=1.0, answer_timeout=1.0, sync=b"V\r", sync_prefix=b"V"
+        "can232",
+        queue=1,
+        window=1,
+        deadline=1.0,
+        stuck=1.0,
+        answer_timeout=1.0,
+        sync=b"V\r",
+        sync_prefix=b"V",
     )
     counters = relay.counters()
     counted = counters[kind] if kind != "counters" else counters.keys() - {"tx_dropped", "rx_dropped"}

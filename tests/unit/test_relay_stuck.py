@@ -11,7 +11,7 @@ from bridged import _relay
 
 @pytest.fixture
 def rig() -> Iterator[Rig]:
-    r = Rig(deadline=0.1)
+    r = Rig(deadline=0.1, stuck=0.5)
     yield r
     r.close()
 
@@ -72,7 +72,7 @@ def test_a_queue_of_another_size_keeps_the_oldest(rig: Rig, queue: int, kept: in
         rig.bus.send(can_frame(number))
     rig.turn()
     assert rig.counters()["queued"] == 8  # the first of them is under way
-    rig.relay.set_queue(queue, 5.0)
+    rig.relay.set_queue(queue, 5.0, 5.0)
     counters = rig.counters()
     assert (counters["queued"], counters["queue-full"]) == (1 + kept, 7 - kept)
     rig.turn(200)  # with the new deadline they are not too old
@@ -85,7 +85,9 @@ def test_a_queue_of_another_size_keeps_the_oldest(rig: Rig, queue: int, kept: in
     assert sent == list(range(100, 101 + kept))
 
 
-@pytest.mark.parametrize(("queue", "deadline"), [(0, 1.0), (1, 0.0), (1, float("nan"))])
-def test_a_queue_that_is_none_is_refused(rig: Rig, queue: int, deadline: float) -> None:
+@pytest.mark.parametrize(
+    ("queue", "deadline", "stuck"), [(0, 1.0, 1.0), (1, 0.0, 1.0), (1, float("nan"), 1.0), (1, 1.0, 0.0)]
+)
+def test_a_queue_that_is_none_is_refused(rig: Rig, queue: int, deadline: float, stuck: float) -> None:
     with pytest.raises(ValueError, match="queue is 1 to 65536"):
-        rig.relay.set_queue(queue, deadline)
+        rig.relay.set_queue(queue, deadline, stuck)
