@@ -20,9 +20,7 @@ EVENT_NOISE: Final[int]  # bytes that are no message, before frames are received
 EVENT_FRAME_REFUSED: Final[int]  # the adapter refused a frame; token: how many retries so far. Not at each
 EVENT_UNANSWERED: Final[int]  # an answer is missing: the line is being resynchronised
 EVENT_SILENT: Final[int]  # not even the sync command is answered; nothing is sent until a new attach
-EVENT_STUCK: Final[
-    int
-]  # no frame has left the device's buffer for `stuck` seconds; token: how many, 0: not known
+EVENT_STUCK: Final[int]  # no frame has left the device for `stuck`; token: how many are in it, 0: not known
 EVENT_STAMPED: Final[int]  # a frame had a time stamp; said once per attach
 EVENT_PORT_LOST: Final[int]  # token: errno, 0 for end of file
 EVENT_BUS_DOWN: Final[int]  # the interface is down
@@ -33,8 +31,9 @@ class Relay:
     """Relays frames between a port (bytes) and a bus (datagrams of struct can_frame).
 
     Times are seconds. `window`: how many frames and commands may be unanswered. `deadline`: a frame
-    older than this is not sent. `stuck`: EVENT_STUCK when no frame has left the device for so long. `sync`: a command whose answer, a text that begins with `sync_prefix`,
-    cannot be taken for any other answer; sent to find the thread again after an answer was lost.
+    older than this is not sent. `stuck`: EVENT_STUCK when no frame has left the device for so long.
+    `sync`: a command whose answer, a text that begins with `sync_prefix`, cannot be taken for any other
+    answer; sent to find the thread again after an answer was lost.
     Raises ValueError or OverflowError for what is out of range, OSError when descriptors or memory run out.
     A child made by fork() must leave the relays of its parent alone: a lock may be held in it for ever.
     """

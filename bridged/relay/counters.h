@@ -40,7 +40,7 @@
     X(EVENT_FRAME_REFUSED, "the adapter refused a frame; token: how many retries so far. Not at each") \
     X(EVENT_UNANSWERED, "an answer is missing: the line is being resynchronised") \
     X(EVENT_SILENT, "not even the sync command is answered; nothing is sent until a new attach") \
-    X(EVENT_STUCK, "no frame has left the device's buffer for `stuck` seconds; token: how many, 0: not known") \
+    X(EVENT_STUCK, "no frame has left the device for `stuck`; token: how many are in it, 0: not known") \
     X(EVENT_STAMPED, "a frame had a time stamp; said once per attach") \
     X(EVENT_PORT_LOST, "token: errno, 0 for end of file") \
     X(EVENT_BUS_DOWN, "the interface is down") \

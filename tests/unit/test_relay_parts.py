@@ -13,8 +13,7 @@ import bridged
 ROOT = Path(bridged.__file__).parents[1]
 RELAY = ROOT / "bridged" / "relay"
 MODULE = {"values", "counters", "codec", "clock", "relay"}
-# Each part and those that it may include, in its header or its source. Includes go one way: no part is named before it
-# is explained.
+# Each part and those that it may include, in its header or its source; only those above it in this list.
 ALLOWED: dict[str, set[str]] = {
     "values": set(),
     "counters": set(),
