@@ -151,7 +151,7 @@ class BusEnd:
         """The open bus, for a successor's use(), with `reason`; None: there is none."""
         if self.bus is None:
             return None
-        self._put(self._limit.take(math.inf))
+        self._put(self._limit.take_all())
         self._relay.detach_bus()
         bus, self.bus = self.bus, None
         return bus
@@ -160,7 +160,7 @@ class BusEnd:
         """Idempotent."""
         if self.bus is None:
             return
-        self._put(self._limit.take(math.inf))
+        self._put(self._limit.take_all())
         self._relay.detach_bus()
         self._dropped_before = self._dropped()
         self.bus.close()
@@ -216,13 +216,20 @@ class ErrorFrameLimit:
         return self.take(now)
 
     def take(self, now: float) -> list[bytes]:
-        """Those that may go now; with math.inf all."""
+        """Those that may go now."""
         frames = []
         for is_state in (False, True):  # a restart before the state after it
             if is_state in self._waiting and now >= self._free_at[is_state]:
                 frames.append(self._waiting.pop(is_state))
                 self._free_at[is_state] = now + ERROR_FRAME_INTERVAL_S
         self.next_at = min((self._free_at[is_state] for is_state in self._waiting), default=None)
+        return frames
+
+    def take_all(self) -> list[bytes]:
+        """Those that wait, for an interface that is about to be closed."""
+        frames = [self._waiting[is_state] for is_state in sorted(self._waiting)]
+        self._waiting.clear()
+        self.next_at = None
         return frames
 
 

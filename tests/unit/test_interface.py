@@ -98,12 +98,12 @@ def bench(
         bus.far.close()
 
 
-def received(bench: Bench) -> list[bytes]:
-    """What others on the interface have got."""
+def received(bench: Bench, bus: int = 0) -> list[bytes]:
+    """What others on the interface, opened for the first time or again, have got."""
     frames = []
-    bench.buses[0].far.setblocking(False)
+    bench.buses[bus].far.setblocking(False)
     with contextlib.suppress(BlockingIOError):
-        while frame := bench.buses[0].far.recv(64):
+        while frame := bench.buses[bus].far.recv(64):
             frames.append(frame)
     return frames
 
@@ -236,6 +236,20 @@ def test_an_error_frame_that_waits_is_told_before_the_interface_is_closed(bench:
         bench.end.put_error_frame(error_frame(CAN_ERR_CRTL, crtl=0x08, tec=tec))
     bench.end.hand_over()
     assert [frame[14] for frame in received(bench)] == [1, 3]
+
+
+def test_error_frames_go_on_on_an_interface_that_was_lost_while_one_waited(bench: Bench) -> None:
+    bench.end.open()
+    for tec in (1, 2):
+        bench.end.put_error_frame(error_frame(CAN_ERR_CRTL, crtl=0x08, tec=tec))
+    bench.end.on_lost(errno.ENODEV)
+    bench.pass_time(1.0)
+    for tec in (3, 4):
+        bench.end.put_error_frame(error_frame(CAN_ERR_CRTL, crtl=0x08, tec=tec))
+    bench.pass_time(1.0)
+    assert [frame[14] for frame in received(bench)] == [1, 2]
+    assert [frame[14] for frame in received(bench, 1)] == [3, 4]
+    assert bench.end.next_at is None
 
 
 def test_handed_over(bench: Bench) -> None:
