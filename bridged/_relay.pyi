@@ -1,6 +1,8 @@
 """The data plane in C (bridged/relay): one Relay moves the frames of one bridge."""
 
-from typing import Final, Protocol, Self
+from typing import Final, Protocol, Self, final
+
+from _typeshed import structseq
 
 class _HasFileno(Protocol):
     def fileno(self) -> int: ...
@@ -26,6 +28,21 @@ EVENT_PORT_LOST: Final[int]  # token: errno, 0 for end of file
 EVENT_BUS_DOWN: Final[int]  # the interface is down
 EVENT_BUS_LOST: Final[int]  # token: errno, 0 for end of file
 WINDOW_MAX: Final[int]
+
+@final
+class Tally(structseq[int], tuple[int, int, int, int, int]):
+    """Some of the relay's counters, under the names that counters() has."""
+
+    @property
+    def decoded(self) -> int: ...
+    @property
+    def rx_frames(self) -> int: ...
+    @property
+    def tx_frames(self) -> int: ...
+    @property
+    def rx_overruns(self) -> int: ...
+    @property
+    def skipped_bytes(self) -> int: ...
 
 class Relay:
     """Relays frames between a port (bytes) and a bus (datagrams of struct can_frame).
@@ -102,8 +119,8 @@ class Relay:
         """
     def events(self) -> list[tuple[int, int, bytes]]:
         """What happened since the last call: (EVENT_…, token, text)."""
-    def tally(self) -> tuple[int, int, int, int, int]:
-        """Of the counters: decoded, rx_frames, tx_frames, rx_overruns, skipped_bytes; for frequent looks."""
+    def tally(self) -> Tally:
+        """Some of the counters, for frequent looks."""
 
     def glimpse(self) -> tuple[bytes, bytes]:
         """A frame that came from the bus lately and one that went to it; zeros before there is one."""

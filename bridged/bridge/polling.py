@@ -18,6 +18,7 @@ from bridged.errors import AdapterError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from bridged import _relay
     from bridged.adapters.base import Adapter, Answer, Exchange
 
 log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ class HealthPolling:
         failed: Callable[[str], None],
         bus_off: Callable[[str], None],
         stuck_s: float,
-        tally: Callable[[], tuple[int, int, int, int, int]],
+        tally: Callable[[], _relay.Tally],
     ) -> None:
         self.health = Health()
         self.next_at: float | None = None
@@ -82,8 +83,9 @@ class HealthPolling:
         """The adapter runs; `restarted`: after bus-off."""
         if restarted:
             self._take(Observation("restarted", happened=Happened.RESTARTED))
-        decoded, _, tx_frames, self._overruns_seen, self._noise_seen = self._tally()
-        self._stall = Stall(self._stall.limit_s, decoded, tx_frames)
+        counted = self._tally()
+        self._overruns_seen, self._noise_seen = counted.rx_overruns, counted.skipped_bytes
+        self._stall = Stall(self._stall.limit_s, counted.decoded, counted.tx_frames)
         self._unknown = 0
         self.next_at = now
 
@@ -149,7 +151,7 @@ class HealthPolling:
 
     def heard_noise(self) -> bool:
         """Whether bytes without meaning came since the last look, and since this was asked last."""
-        return self._is_news(self._tally()[-1])
+        return self._is_news(self._tally().skipped_bytes)
 
     def _is_news(self, noise: int) -> bool:
         before, self._noise_seen = self._noise_seen, noise
@@ -199,16 +201,16 @@ class HealthPolling:
         if self._unknown == UNKNOWN_LIMIT:
             self._failed("the adapter does not answer questions about its bus")
             return
-        decoded, rx_frames, tx_frames, overruns, skipped = self._tally()
-        self._sample(now, rx_frames, tx_frames)
-        if self._stall.observe(seen, now, decoded, tx_frames):
+        counted = self._tally()
+        self._sample(now, counted.rx_frames, counted.tx_frames)
+        if self._stall.observe(seen, now, counted.decoded, counted.tx_frames):
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
             self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
             return
-        if self._is_news(skipped):
+        if self._is_news(counted.skipped_bytes):
             self._warn(f"%s ({NOISE_CAUSES})", NOISE)
-        if overruns != self._overruns_seen:
-            self._overruns_seen = overruns
+        if counted.rx_overruns != self._overruns_seen:
+            self._overruns_seen = counted.rx_overruns
             text = "the adapter lost received frames"
             self._warn("%s: they were not fetched quickly enough", text)
             self._take(Observation(text, happened=Happened.RX_OVERFLOW))

@@ -27,6 +27,10 @@ static const struct {
 enum { EVENTS_BATCH = 32 }; /* taken at once, with the lock */
 static_assert(EVENTS_MAX % EVENTS_BATCH == 0, "events() returns EVENTS_MAX at most");
 
+struct module_state {
+    PyTypeObject *tally_type;
+};
+
 typedef struct {
     PyObject_HEAD
     struct relay *relay;
@@ -436,8 +440,8 @@ static PyObject *Relay_tally(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
     struct snapshot now;
     relay_snapshot(self_relay(self), &now);
-    const struct counters *c = &now.counters;
-    return Py_BuildValue("(KKKKK)", c->decoded, c->delivered, c->confirmed, c->overruns, c->skipped_bytes);
+    const struct module_state *state = PyType_GetModuleState(Py_TYPE(self));
+    return tally_object(state->tally_type, &now.counters);
 }
 
 static PyMethodDef RELAY_METHODS[] = {
@@ -494,14 +498,43 @@ static PyMethodDef MODULE_METHODS[] = {
     {NULL, NULL, 0, NULL},
 };
 
+/* Takes the reference to `object`, which may be NULL with an exception. */
+static int add_object(PyObject *module, const char *name, PyObject *object)
+{
+    int result = object ? PyModule_AddObjectRef(module, name, object) : -1;
+    Py_XDECREF(object);
+    return result;
+}
+
 static int module_exec(PyObject *module)
 {
-    PyObject *type = PyType_FromModuleAndSpec(module, &RELAY_SPEC, NULL);
-    int result = type ? PyModule_AddObjectRef(module, "Relay", type) : -1;
-    Py_XDECREF(type);
+    struct module_state *state = PyModule_GetState(module);
+    state->tally_type = tally_type();
+    int result = add_object(module, "Tally", Py_XNewRef((PyObject *)state->tally_type));
+    if (result == 0)
+        result = add_object(module, "Relay", PyType_FromModuleAndSpec(module, &RELAY_SPEC, NULL));
     for (size_t i = 0; result == 0 && i < sizeof CONSTANTS / sizeof CONSTANTS[0]; i++)
         result = PyModule_AddIntConstant(module, CONSTANTS[i].name, CONSTANTS[i].value);
     return result;
+}
+
+static int module_traverse(PyObject *module, visitproc visit, void *arg)
+{
+    const struct module_state *state = PyModule_GetState(module);
+    Py_VISIT(state->tally_type);
+    return 0;
+}
+
+static int module_clear(PyObject *module)
+{
+    struct module_state *state = PyModule_GetState(module);
+    Py_CLEAR(state->tally_type);
+    return 0;
+}
+
+static void module_free(void *module)
+{
+    module_clear(module);
 }
 
 static PyModuleDef_Slot MODULE_SLOTS[] = {{Py_mod_exec, (void *)module_exec}, {0, NULL}};
@@ -510,8 +543,12 @@ static struct PyModuleDef MODULE = {
     PyModuleDef_HEAD_INIT,
     .m_name = "bridged._relay",
     .m_doc = "The data plane of can-bridge.",
+    .m_size = sizeof(struct module_state),
     .m_methods = MODULE_METHODS,
     .m_slots = MODULE_SLOTS,
+    .m_traverse = module_traverse,
+    .m_clear = module_clear,
+    .m_free = module_free,
 };
 
 PyMODINIT_FUNC PyInit__relay(void)

@@ -12,5 +12,7 @@ PyObject *module_decode(PyObject *module, PyObject *args);
 PyObject *module_encode(PyObject *module, PyObject *args);
 PyObject *module_meanings(PyObject *module, PyObject *ignored);
 PyObject *counters_dict(const struct snapshot *s);
+PyTypeObject *tally_type(void); /* a new reference */
+PyObject *tally_object(PyTypeObject *type, const struct counters *c);
 
 #endif

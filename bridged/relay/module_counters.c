@@ -1,5 +1,8 @@
-/* The relay's counters as a dict, and what the names in counters.h mean. */
+/* The relay's counters as a dict, some of them as a tuple with names, and what the names in counters.h mean. */
 #include "module.h"
+
+#include <stddef.h>
+#include <string.h>
 
 #define NAME_IN_PYTHON(name, python, meaning) python,
 static const char *const TX_DROP_NAMES[] = {TX_DROP_LIST(NAME_IN_PYTHON)};
@@ -47,6 +50,49 @@ PyObject *counters_dict(const struct snapshot *s)
     Py_XDECREF(tx);
     Py_XDECREF(rx);
     return dict;
+}
+
+/* The counters that are looked at often; their order is nobody's affair but this list's. */
+static const struct {
+    const char *name;
+    size_t field;
+} TALLY[] = {
+    {"decoded", offsetof(struct counters, decoded)},
+    {"rx_frames", offsetof(struct counters, delivered)},
+    {"tx_frames", offsetof(struct counters, confirmed)},
+    {"rx_overruns", offsetof(struct counters, overruns)},
+    {"skipped_bytes", offsetof(struct counters, skipped_bytes)},
+};
+
+enum { TALLY_SIZE = sizeof TALLY / sizeof TALLY[0] };
+
+PyTypeObject *tally_type(void)
+{
+    PyStructSequence_Field fields[TALLY_SIZE + 1] = {0};
+    for (size_t i = 0; i < TALLY_SIZE; i++)
+        fields[i].name = TALLY[i].name;
+    PyStructSequence_Desc description = {
+        .name = "bridged._relay.Tally",
+        .doc = "Some of the relay's counters, for frequent looks.",
+        .fields = fields,
+        .n_in_sequence = TALLY_SIZE,
+    };
+    return PyStructSequence_NewType(&description);
+}
+
+PyObject *tally_object(PyTypeObject *type, const struct counters *c)
+{
+    PyObject *tally = PyStructSequence_New(type);
+    for (size_t i = 0; tally && i < TALLY_SIZE; i++) {
+        uint64_t value;
+        memcpy(&value, (const char *)c + TALLY[i].field, sizeof value);
+        PyObject *number = PyLong_FromUnsignedLongLong(value);
+        if (number)
+            PyStructSequence_SetItem(tally, (Py_ssize_t)i, number);
+        else
+            Py_CLEAR(tally);
+    }
+    return tally;
 }
 
 #define NAME_AND_MEANING(name, python, meaning) {python, meaning},

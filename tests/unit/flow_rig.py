@@ -200,7 +200,8 @@ class Rig:
         tx = c.pop("tx_dropped")
         del c["rx_dropped"]
         looked_at = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
-        assert self.relay.tally() == tuple(c[name] for name in looked_at)
+        tally = self.relay.tally()
+        assert [getattr(tally, name) for name in looked_at] == [c[name] for name in looked_at]
         return {**c, **tx, "tx_dropped": sum(tx.values())}  # type: ignore[dict-item]
 
     def close(self) -> None:

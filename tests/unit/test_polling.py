@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import pytest
 
+from bridged import _relay
 from bridged.adapters.base import UNKNOWN, Answer, Exchange, Observation, Reply
 from bridged.bridge.polling import UNKNOWN_LIMIT, HealthPolling
 from bridged.can import BusState, error_frame, state_of
@@ -54,7 +55,7 @@ class Bench:
             failed=self.failed.append,
             bus_off=self.off.append,
             stuck_s=0.0,
-            tally=lambda: (*self.counters.values(),),
+            tally=lambda: _relay.Tally(self.counters.values()),
         )
         self.polling.start(0.0)
         self.polling.on_timer(0.0)

@@ -88,7 +88,8 @@ class Rig:
         check_books(c, c["queued"])
         tx, rx = c.pop("tx_dropped"), c.pop("rx_dropped")
         looked_at = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
-        assert self.relay.tally() == tuple(c[name] for name in looked_at)
+        tally = self.relay.tally()
+        assert [getattr(tally, name) for name in looked_at] == [c[name] for name in looked_at]
         return {**c, **tx, **{f"rx {k}": v for k, v in rx.items()}}  # type: ignore[dict-item]
 
     def events(self) -> list[tuple[int, int, bytes]]:
