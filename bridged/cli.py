@@ -21,7 +21,7 @@ from bridged.text import printable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bridged.config import Config
+    from bridged.settings import Config
 
 EX_CONFIG = 78  # sysexits.h
 WATCH_INTERVAL_S = 1.0
@@ -139,7 +139,8 @@ def _check_one(path: Path) -> None:
     config, warnings = check(path)
     for warning in warnings:
         print(printable(warning), file=sys.stderr)
-    adapter, channel, bus = config.adapter, config.channel, config.bus
+    adapter: Any = config.adapter
+    channel, bus = config.channel, config.bus
     rate = f" at {adapter.baudrate} Bd" if adapter.type == "can232" else ""
     print(
         f"{printable(str(config.path))}: OK: {adapter.type} on {adapter.port}{rate}, "

@@ -3,7 +3,7 @@
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -11,6 +11,15 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bridged import can
 from bridged.ports.names import USB_DEVICE, is_numbered_terminal, port_problem
+from bridged.settings import (
+    AdapterConfig,
+    BusConfig,
+    ChannelConfig,
+    Config,
+    HealthConfig,
+    ReconnectConfig,
+    TransmitConfig,
+)
 from bridged.text import quoted
 from bridged.yaml_source import (
     Problems,
@@ -86,7 +95,7 @@ class _AdapterKeys(Struct, frozen=True, kw_only=True):
     ready_limit: ReadyLimit | None = None
 
 
-class Can232Config(Struct, frozen=True, kw_only=True):
+class Can232Config(AdapterConfig, frozen=True, kw_only=True):
     """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s.
 
     `firmware` "can232": what is there is a CAN232 for certain; None: it may be a clone, and is treated so
@@ -103,7 +112,7 @@ class Can232Config(Struct, frozen=True, kw_only=True):
     firmware: Firmware | None = None
 
 
-class Usb2canConfig(Struct, frozen=True, kw_only=True):
+class Usb2canConfig(AdapterConfig, frozen=True, kw_only=True):
     """A USB2CAN, and how to reach it. `port` is an absolute path, socket:// or usb://VID:PID[/SERIAL].
 
     With so many frames in its transmit buffer the adapter says stop (`critical_limit`) and go on
@@ -119,8 +128,9 @@ class Usb2canConfig(Struct, frozen=True, kw_only=True):
     critical_limit: CriticalLimit = CRITICAL_LIMIT
     ready_limit: ReadyLimit = READY_LIMIT
 
-
-AdapterConfig: TypeAlias = Can232Config | Usb2canConfig
+    @property
+    def usb_serial_number(self) -> str | None:
+        return self.serial_number
 
 
 class _AcceptanceKeys(Struct, frozen=True, kw_only=True):
@@ -139,29 +149,10 @@ class _ChannelKeys(Struct, frozen=True, kw_only=True):
     restart: Restart | None = None
 
 
-class ChannelConfig(Struct, frozen=True, kw_only=True):
-    """The CAN bus behind the adapter. `acceptance` None: every frame passes.
-
-    `restart_s`: after bus-off the channel is closed, and opened again after so long; None: not until the
-    interface comes up anew; 0: it stays open, the adapter restarts itself.
-    """
-
-    timing: can.BitTiming
-    listen_only: bool = False
-    acceptance: can.AcceptanceFilter | None = None
-    restart_s: float | None = 0.0
-
-
 class _BusKeys(Struct, frozen=True, kw_only=True):
     interface: InterfaceType = "socketcan"
     channel: InterfaceName
     create: Flag = False
-
-
-class BusConfig(_BusKeys, frozen=True, kw_only=True):
-    """The CAN interface on the host's side; `options` go to python-can as keyword arguments."""
-
-    options: dict[str, Any] = {}
 
 
 class _TransmitKeys(Struct, frozen=True, kw_only=True):
@@ -170,39 +161,14 @@ class _TransmitKeys(Struct, frozen=True, kw_only=True):
     deadline_s: Deadline = msgspec.field(default=1.0, name="deadline")
 
 
-class TransmitConfig(Struct, frozen=True, kw_only=True):
-    """How frames wait for the adapter: `queue` and `window` in frames; dropped after `deadline_s`."""
-
-    queue: int
-    window: int
-    deadline_s: float
+class _HealthKeys(Struct, frozen=True, kw_only=True):
+    interval_s: Interval | None = msgspec.field(default=None, name="interval")
+    error_frames: Flag | None = None
 
 
-class HealthConfig(Struct, frozen=True, kw_only=True):
-    """How the adapter is watched: asked each `interval_s`; bus states as CAN error frames on the bus."""
-
-    interval_s: Interval = msgspec.field(default=0.25, name="interval")
-    error_frames: Flag = True
-
-
-class ReconnectConfig(Struct, frozen=True, kw_only=True):
-    """The pause before the adapter is tried again: `initial_s`, then doubling up to `maximum_s`."""
-
-    initial_s: Pause = msgspec.field(default=0.1, name="initial")
-    maximum_s: Pause = msgspec.field(default=5.0, name="maximum")
-
-
-class Config(Struct, frozen=True, kw_only=True):
-    """One bridge. `name` is the stem of the file's name."""
-
-    name: str
-    path: Path
-    adapter: AdapterConfig
-    channel: ChannelConfig
-    bus: BusConfig
-    transmit: TransmitConfig
-    health: HealthConfig = HealthConfig()
-    reconnect: ReconnectConfig = ReconnectConfig()
+class _ReconnectKeys(Struct, frozen=True, kw_only=True):
+    initial_s: Pause | None = msgspec.field(default=None, name="initial")
+    maximum_s: Pause | None = msgspec.field(default=None, name="maximum")
 
 
 _SECTIONS: dict[str, type[Struct]] = {
@@ -211,11 +177,11 @@ _SECTIONS: dict[str, type[Struct]] = {
     "channel.acceptance": _AcceptanceKeys,
     "bus": _BusKeys,
     "transmit": _TransmitKeys,
-    "health": HealthConfig,
-    "reconnect": ReconnectConfig,
+    "health": _HealthKeys,
+    "reconnect": _ReconnectKeys,
 }
 
-_ADAPTERS: dict[str, type[AdapterConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
+_ADAPTERS: dict[str, type[Can232Config | Usb2canConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
 
 _SPOKEN_BY_CAN232 = ("slcan", "slcand", "lawicel")
 
@@ -258,7 +224,7 @@ def check(path: str | os.PathLike[str]) -> tuple[Config, list[str]]:
     section = top.section("transmit") if "transmit" in top.nodes else None
     if section and transmit.deadline_s > LONG_DEADLINE_S:
         section.warn_key("deadline", f"a frame may reach the bus {transmit.deadline_s:g} s after it was sent")
-    if section and adapter.type == "can232" and transmit.window > CAN232_COMMANDS:
+    if section and isinstance(adapter, Can232Config) and transmit.window > CAN232_COMMANDS:
         text = f"a CAN232 can hold {CAN232_COMMANDS} commands, more of them may be lost"
         section.warn_key("window", text)
     section = top.section("bus")
@@ -315,7 +281,7 @@ def _read_file(path: Path, top: Section) -> Config | None:
         )
     health: HealthConfig | None = HealthConfig()
     if "health" in top.nodes:
-        health = _read_plain(top.section("health", required=False), HealthConfig)
+        health = _read_plain(top.section("health", required=False), _HealthKeys, HealthConfig)
     reconnect = _read_reconnect(top)
     if top.problems or not (adapter and channel and bus and transmit and health and reconnect):
         return None
@@ -334,16 +300,16 @@ def _read_file(path: Path, top: Section) -> Config | None:
 _S = TypeVar("_S", bound=Struct)
 
 
-def _read_plain(section: Section | None, schema: type[_S]) -> _S | None:
-    """Read a section in which every key stands for itself; None, reported, if one is wrong."""
+def _read_plain(section: Section | None, schema: type[Struct], settings: type[_S]) -> _S | None:
+    """Read a section in which every key stands for itself; None, reported, if one is missing or wrong."""
     if section is None:
         return None
     values = section.read(schema)
     complete = all(field.name in values or not field.required for field in msgspec.structs.fields(schema))
-    return schema(**values) if complete else None
+    return settings(**values) if complete else None
 
 
-def _read_adapter(section: Section | None) -> AdapterConfig | None:
+def _read_adapter(section: Section | None) -> Can232Config | Usb2canConfig | None:
     if section is None:
         return None
     node = section.nodes.get("type")
@@ -352,7 +318,7 @@ def _read_adapter(section: Section | None) -> AdapterConfig | None:
         section.refuse_value("type", meant)
         node.value = "can232"  # for the other keys
     type_: str | None = node.value if isinstance(node, ScalarNode) and node.value in _ADAPTERS else None
-    adapter: AdapterConfig | None = None
+    adapter: Can232Config | Usb2canConfig | None = None
     if type_ is None:
         section.read(_AdapterKeys)
     else:
@@ -360,7 +326,7 @@ def _read_adapter(section: Section | None) -> AdapterConfig | None:
             if key in section.keys:
                 section.refuse_key(key, why)
                 del section.keys[key]  # or it would be reported as unknown too
-        adapter = _read_plain(section, _ADAPTERS[type_])
+        adapter = _read_plain(section, _ADAPTERS[type_], _ADAPTERS[type_])
     if text := port_problem(section.values.get("port", "/"), type_):
         section.refuse_value("port", text)
     if type_ == "usb2can":
@@ -400,9 +366,11 @@ def _check_limits(section: Section) -> None:
     section.refuse_value(given[-1], text)
 
 
-def _read_transmit(section: Section | None, adapter: AdapterConfig | None) -> TransmitConfig | None:
+def _read_transmit(
+    section: Section | None, adapter: Can232Config | Usb2canConfig | None
+) -> TransmitConfig | None:
     """Read `transmit`; without the section, and for what it leaves out, its defaults."""
-    keys = _read_plain(section, _TransmitKeys) or _TransmitKeys()
+    keys = _read_plain(section, _TransmitKeys, _TransmitKeys) or _TransmitKeys()
     if adapter is None:
         return None
     window = adapter.default_window if keys.window is None else keys.window
@@ -429,21 +397,23 @@ def _read_reconnect(top: Section) -> ReconnectConfig | None:
     if "reconnect" not in top.nodes:
         return ReconnectConfig()
     section = top.section("reconnect", required=False)
-    reconnect = _read_plain(section, ReconnectConfig)
+    reconnect = _read_plain(section, _ReconnectKeys, ReconnectConfig)
     if section and reconnect and reconnect.initial_s > reconnect.maximum_s:
         text = f"initial ({reconnect.initial_s:g} s) is more than maximum ({reconnect.maximum_s:g} s)"
         section.refuse_value("maximum" if "maximum" in section.nodes else "initial", text)
     return reconnect
 
 
-def _read_channel(section: Section | None, adapter: AdapterConfig | None) -> ChannelConfig | None:
+def _read_channel(
+    section: Section | None, adapter: Can232Config | Usb2canConfig | None
+) -> ChannelConfig | None:
     if section is None:
         return None
     values = section.read(_ChannelKeys)
     timing = _read_timing(section)
     acceptance = None
     if "acceptance" in section.nodes and (
-        keys := _read_plain(section.section("acceptance", required=False), _AcceptanceKeys)
+        keys := _read_plain(section.section("acceptance", required=False), _AcceptanceKeys, _AcceptanceKeys)
     ):
         acceptance = can.AcceptanceFilter(keys.code, keys.mask, single=keys.mode == "single")
     if timing is None or adapter is None:

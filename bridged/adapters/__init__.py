@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bridged.adapters.base import Adapter, Memory
-    from bridged.config import Config
+    from bridged.settings import Config
 
 
 def make_adapter(config: Config, memory: Memory) -> Adapter:
     """The adapter that the configuration names; only its module is loaded."""
-    adapter = config.adapter
+    adapter: Any = config.adapter
     if adapter.type == "usb2can":
         from bridged.adapters.usb2can import Usb2can  # noqa: PLC0415
 

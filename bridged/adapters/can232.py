@@ -28,7 +28,8 @@ from bridged.text import printable
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping, Sequence
 
-    from bridged.config import Can232Config, ChannelConfig
+    from bridged.config import Can232Config
+    from bridged.settings import ChannelConfig
 
 log = logging.getLogger(__name__)
 

@@ -25,7 +25,8 @@ from bridged.errors import AdapterError, WrongDeviceError
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
-    from bridged.config import ChannelConfig, Usb2canConfig
+    from bridged.config import Usb2canConfig
+    from bridged.settings import ChannelConfig
 
 log = logging.getLogger(__name__)
 

@@ -37,9 +37,9 @@ from bridged.ports.watch import Watch
 
 if TYPE_CHECKING:
     from bridged.adapters.base import Memory
-    from bridged.config import Config
     from bridged.interfaces.base import Bus
     from bridged.ports import Port
+    from bridged.settings import Config
 
 log = logging.getLogger(__name__)
 
@@ -96,9 +96,7 @@ class Bridge:
         self._timer: float | None = None
         reconnect = config.reconnect
         self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, chance)
-        # A CAN232's own serial number is not that of a USB device.
-        usb = config.adapter.type == "usb2can"
-        self._watch = Watch(config.adapter.port, config.adapter.serial_number if usb else None)
+        self._watch = Watch(config.adapter.port, config.adapter.usb_serial_number)
         self._sharing = Sharing()
         self._path = config.adapter.port  # where it was last
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()

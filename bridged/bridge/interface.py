@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bridged import _relay
-    from bridged.config import Config
     from bridged.interfaces.base import Bus
+    from bridged.settings import Config
 
 log = logging.getLogger(__name__)
 

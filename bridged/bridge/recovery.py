@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from bridged.adapters.base import Adapter
     from bridged.bridge.polling import HealthPolling
-    from bridged.config import Config
+    from bridged.settings import Config
 
 log = logging.getLogger(__name__)
 

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from bridged.bridge.bridge import Bridge
-    from bridged.config import Config
     from bridged.daemon.neighbours import Neighbours
     from bridged.daemon.status import StatusServer
+    from bridged.settings import Config
 
 log = logging.getLogger(__name__)
 

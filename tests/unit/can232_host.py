@@ -7,8 +7,9 @@ from bridged import _relay
 from bridged.adapters.base import Answer, Exchange, Reply, Steps
 from bridged.adapters.can232 import Can232
 from bridged.can import BitTiming
-from bridged.config import Can232Config, ChannelConfig
+from bridged.config import Can232Config
 from bridged.errors import AdapterError
+from bridged.settings import ChannelConfig
 
 KINDS = {"ok": Reply.OK, "refused": Reply.REFUSED, "text": Reply.TEXT}
 

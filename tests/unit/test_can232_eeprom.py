@@ -9,7 +9,7 @@ from clone_parsers import Reference
 
 from bridged import cli
 from bridged.can import AcceptanceFilter, BitTiming
-from bridged.config import ChannelConfig
+from bridged.settings import ChannelConfig
 
 
 @pytest.mark.parametrize(

@@ -16,16 +16,9 @@ import pytest
 
 from bridged import config
 from bridged.can import AcceptanceFilter, BitTiming
-from bridged.config import (
-    BusConfig,
-    Can232Config,
-    ChannelConfig,
-    ReconnectConfig,
-    TransmitConfig,
-    Usb2canConfig,
-    load,
-)
+from bridged.config import Can232Config, Usb2canConfig, load
 from bridged.errors import ConfigError
+from bridged.settings import BusConfig, ChannelConfig, Config, ReconnectConfig, TransmitConfig
 from bridged.yaml_source import key_names
 
 if TYPE_CHECKING:
@@ -124,7 +117,7 @@ def problems_of(file: Path, content: str | bytes) -> list[str]:
 def test_the_whole_schema(file: Path) -> None:
     file.write_text(ISSUE)
     loaded = load(str(file))
-    assert loaded == config.Config(
+    assert loaded == Config(
         name="test",
         path=file,
         adapter=Can232Config(type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number="A123"),

@@ -18,9 +18,19 @@ ANYWHERE = {"errors", "text"}
 # Each part of the house and the parts that it may import; what is not listed here may not be imported.
 ALLOWED: dict[str, set[str]] = {
     "__main__": {"cli"},
-    "cli": {"adapters", "bridge", "config", "daemon", "demo", "interfaces", "ports", "simulators"},
+    "cli": {
+        "adapters",
+        "bridge",
+        "config",
+        "daemon",
+        "demo",
+        "interfaces",
+        "ports",
+        "settings",
+        "simulators",
+    },
     "demo": {"bridge", "config", "daemon", "interfaces", "simulators"},
-    "daemon": {"bridge", "config"},
+    "daemon": {"bridge", "config", "settings"},
     "bridge": {"adapters", "can", "interfaces", "ports", "settings", "_relay"},
     "config": {"adapters", "can", "interfaces", "ports.names", "settings", "yaml_source"},
     "yaml_source": set(),
@@ -35,7 +45,7 @@ ALLOWED: dict[str, set[str]] = {
 }
 
 # Still to be paid off: their values are to move to settings.py and to the adapters.
-DEBTS = {("adapters", "config"), ("bridge", "config")}
+DEBTS = {("adapters", "config")}
 
 
 def modules() -> dict[str, ast.Module]:
