@@ -7,8 +7,8 @@ from _typeshed import structseq
 class _HasFileno(Protocol):
     def fileno(self) -> int: ...
 
-GATE_AWAY: Final[int]  # frames from the bus are dropped: no adapter
-GATE_OPEN: Final[int]  # frames from the bus are sent
+GATE_AWAY: Final[int]  # frames from the interface are dropped: no adapter
+GATE_OPEN: Final[int]  # frames from the interface are sent
 GATE_LISTEN_ONLY: Final[int]  # dropped: the channel does not send
 GATE_STOPPED: Final[int]  # dropped: the bridge is stopping
 ACCEPT_OK: Final[int]
@@ -25,8 +25,8 @@ EVENT_SILENT: Final[int]  # not even the sync command is answered; nothing is se
 EVENT_STUCK: Final[int]  # no frame has left the device for `stuck`; token: how many are in it, 0: not known
 EVENT_STAMPED: Final[int]  # a frame had a time stamp; said once per attach
 EVENT_PORT_LOST: Final[int]  # token: errno, 0 for end of file
-EVENT_BUS_DOWN: Final[int]  # the interface is down
-EVENT_BUS_LOST: Final[int]  # token: errno, 0 for end of file
+EVENT_INTERFACE_DOWN: Final[int]  # the interface is down
+EVENT_INTERFACE_LOST: Final[int]  # token: errno, 0 for end of file
 WINDOW_MAX: Final[int]
 
 @final
@@ -45,7 +45,7 @@ class Tally(structseq[int], tuple[int, int, int, int, int]):
     def skipped_bytes(self) -> int: ...
 
 class Relay:
-    """Relays frames between a port (bytes) and a bus (datagrams of struct can_frame).
+    """Relays frames between a port (bytes) and an interface (datagrams of struct can_frame).
 
     Times are seconds. `window`: how many frames and commands may be unanswered. `deadline`: a frame
     older than this is not sent. `stuck`: EVENT_STUCK when no frame has left the device for so long.
@@ -93,18 +93,20 @@ class Relay:
         """After attach_port() of the same port: first the rest of the message of cut()."""
     def last_words(self, words: bytes, /) -> None:
         """Say this at once, behind the message that the port took in part; nothing else is sent any more."""
-    def attach_bus(self, fd: int | _HasFileno, /) -> None:
+    def attach_interface(self, fd: int | _HasFileno, /) -> None:
         """Carry frames between the port and this socket; a duplicate and OSError as above."""
-    def detach_bus(self) -> None: ...
-    def hold_bus(self, held: bool, /) -> None:
-        """While `held`, frames from the bus, and from one attached later, wait unread; those to it go on."""
+    def detach_interface(self) -> None: ...
+    def hold_interface(self, held: bool, /) -> None:
+        """While `held`, frames from the interface (or one attached later) wait unread; those to it go on."""
     def set_gates(self, *, receiving: bool, transmit: int) -> None:
-        """Whether frames from the device go to the bus, and what happens to those from the bus."""
+        """Whether frames from the device go to the interface, and what happens to those from it."""
     def set_queue(self, queue: int, deadline: float, stuck: float, /) -> None:
         """All three anew; frames for which there is no room any more are dropped, the newest first."""
     def set_polling(self, request: bytes, prefix: bytes, interval: float, /) -> None:
         """Ask the device for frames with `request` until the port is detached."""
-    def set_flow(self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int) -> None:
+    def set_level_window(
+        self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int
+    ) -> None:
         """For a device that does not answer frames: `ask` follows them, its answer confirms them.
 
         `capacity`, `critical`, `ready`: frames that its transmit buffer holds, and above and below which it
@@ -123,7 +125,7 @@ class Relay:
         """Some of the counters, for frequent looks."""
 
     def glimpse(self) -> tuple[bytes, bytes]:
-        """A frame that came from the bus lately and one that went to it; zeros before there is one."""
+        """A frame that came from the interface lately and one that went to it; zeros before there is one."""
 
     def counters(self) -> dict[str, int | dict[str, int]]:
         """A snapshot between two turns: bus_read = tx_frames + queued + the sum of tx_dropped."""

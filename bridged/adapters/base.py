@@ -53,7 +53,7 @@ class Polling(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """How the window of a device works that does not answer frames: see Relay.set_flow."""
+    """How the window of a device works that does not answer frames: see Relay.set_level_window."""
 
     request: bytes
     prefix: bytes

@@ -158,7 +158,7 @@ class Bridge:
             self._bus_end.open()
         else:
             self._holds_bus = True
-            self._relay.hold_bus(True)
+            self._relay.hold_interface(True)
             assert predecessor is not None
             self._bus_end.use(bus, predecessor._bus_end.reason)
         self._start_with_bus()
@@ -172,7 +172,7 @@ class Bridge:
         self._bus_end.retry_at = None
         hands_over = successor is not None and successor.bus == self.config.bus
         self._holds_bus = False
-        self._relay.hold_bus(hands_over)
+        self._relay.hold_interface(hands_over)
         if hands_over and self.state is State.RUNNING and self._stop_by is None:
             self._stop_by = time.monotonic() + HAND_OVER_S
         elif not hands_over:
@@ -347,7 +347,7 @@ class Bridge:
             self._perform(action)
         if self._holds_bus and self.state not in COMING_UP:
             self._holds_bus = False
-            self._relay.hold_bus(False)
+            self._relay.hold_interface(False)
 
     def _log_transition(self, reason: str) -> None:
         """One line; retries, and what is repeated too often, for those who look for a fault only."""
@@ -473,7 +473,7 @@ class Bridge:
             self._relay.set_polling(polling.request, polling.prefix, polling.interval_s)
         if self.adapter.flow is not None:
             flow = self.adapter.flow
-            self._relay.set_flow(
+            self._relay.set_level_window(
                 flow.request, flow.prefix, capacity=flow.capacity, critical=flow.critical, ready=flow.ready
             )
         listen_only = self.config.channel.listen_only
@@ -502,7 +502,7 @@ class Bridge:
         self._exchanges.forget()
         self._relay.detach_port()
         for kind, token, text in self._relay.events():  # of the port that is no more, or of the bus
-            if kind in {_relay.EVENT_BUS_LOST, _relay.EVENT_BUS_DOWN}:
+            if kind in {_relay.EVENT_INTERFACE_LOST, _relay.EVENT_INTERFACE_DOWN}:
                 self._on_event(kind, token, text)
         self._sharing.closed()
         if self._port is not None:
@@ -544,7 +544,7 @@ class Bridge:
         """The open bus; None: it was lost, or the successor wants another."""
         if successor.bus != self.config.bus:
             return None
-        if any(kind == _relay.EVENT_BUS_LOST for kind, _, _ in self._relay.events()):
+        if any(kind == _relay.EVENT_INTERFACE_LOST for kind, _, _ in self._relay.events()):
             return None
         return self._bus_end.hand_over()
 
@@ -583,9 +583,9 @@ class Bridge:
             self._polling.frame_refused()
         elif kind == _relay.EVENT_STAMPED:
             self.adapter.saw_time_stamps()
-        elif kind == _relay.EVENT_BUS_DOWN:
+        elif kind == _relay.EVENT_INTERFACE_DOWN:
             self._bus_end.on_down()
-        elif kind == _relay.EVENT_BUS_LOST:
+        elif kind == _relay.EVENT_INTERFACE_LOST:
             self._bus_end.on_lost(token)
         elif kind == _relay.EVENT_NOISE:
             self.adapter.saw_noise(text)

@@ -63,7 +63,7 @@ class BusEnd:
     def use(self, bus: Bus, reason: str = "") -> None:
         """An open bus, as that of a bridge that ended; `reason` why it carries nothing: it is down."""
         try:
-            self._relay.attach_bus(bus.fd)
+            self._relay.attach_interface(bus.fd)
         except OSError as error:  # no descriptor is left for it
             self._not_open(f"{bus.description}: {error.strerror}")
             bus.close()
@@ -152,7 +152,7 @@ class BusEnd:
         if self.bus is None:
             return None
         self._put(self._limit.take_all())
-        self._relay.detach_bus()
+        self._relay.detach_interface()
         bus, self.bus = self.bus, None
         return bus
 
@@ -161,7 +161,7 @@ class BusEnd:
         if self.bus is None:
             return
         self._put(self._limit.take_all())
-        self._relay.detach_bus()
+        self._relay.detach_interface()
         self._dropped_before = self._dropped()
         self.bus.close()
         self.bus = None

@@ -43,8 +43,8 @@
     X(EVENT_STUCK, "no frame has left the device for `stuck`; token: how many are in it, 0: not known") \
     X(EVENT_STAMPED, "a frame had a time stamp; said once per attach") \
     X(EVENT_PORT_LOST, "token: errno, 0 for end of file") \
-    X(EVENT_BUS_DOWN, "the interface is down") \
-    X(EVENT_BUS_LOST, "token: errno, 0 for end of file")
+    X(EVENT_INTERFACE_DOWN, "the interface is down") \
+    X(EVENT_INTERFACE_LOST, "token: errno, 0 for end of file")
 
 /* Each is a field of struct counters. */
 #define COUNTER_LIST(X) \

@@ -37,7 +37,7 @@ static bool is_news(enum event_kind kind)
     case EVENT_FRAME_REFUSED:
     case EVENT_UNANSWERED:
     case EVENT_STAMPED:
-    case EVENT_BUS_DOWN:
+    case EVENT_INTERFACE_DOWN:
         return true;
     default:
         return false;

@@ -104,7 +104,7 @@ int intake_read(struct intake *in, int interface, struct moment turn, bool live,
     *now = at.boot_ns;
     if (error == ENETDOWN) {
         in->empty = (struct moment){0, in->empty.wall_ns - in->empty.boot_ns};
-        events_emit(in->events, EVENT_BUS_DOWN, 0, NULL, 0);
+        events_emit(in->events, EVENT_INTERFACE_DOWN, 0, NULL, 0);
     }
     int64_t offset = clock_offset(in, at);
     for (int i = 0; i < n; i++) {

@@ -268,7 +268,7 @@ static PyObject *Relay_last_words(PyObject *self, PyObject *arg)
     Py_RETURN_NONE;
 }
 
-static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
+static PyObject *Relay_attach_interface(PyObject *self, PyObject *arg)
 {
     int fd = PyObject_AsFileDescriptor(arg);
     if (fd < 0)
@@ -279,13 +279,13 @@ static PyObject *Relay_attach_bus(PyObject *self, PyObject *arg)
     Py_RETURN_NONE;
 }
 
-static PyObject *Relay_detach_bus(PyObject *self, PyObject *Py_UNUSED(ignored))
+static PyObject *Relay_detach_interface(PyObject *self, PyObject *Py_UNUSED(ignored))
 {
     relay_detach_interface(self_relay(self));
     Py_RETURN_NONE;
 }
 
-static PyObject *Relay_hold_bus(PyObject *self, PyObject *arg)
+static PyObject *Relay_hold_interface(PyObject *self, PyObject *arg)
 {
     int held = PyObject_IsTrue(arg);
     if (held < 0)
@@ -341,12 +341,12 @@ static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
     Py_RETURN_NONE;
 }
 
-static PyObject *Relay_set_flow(PyObject *self, PyObject *args, PyObject *kwargs)
+static PyObject *Relay_set_level_window(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"ask", "prefix", "capacity", "critical", "ready", NULL};
     struct level_settings set = {0};
     Py_buffer ask, prefix;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "y*y*$O&O&O&:set_flow", names, &ask, &prefix, uint32_from,
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "y*y*$O&O&O&:set_level_window", names, &ask, &prefix, uint32_from,
                                      &set.capacity, uint32_from, &set.critical, uint32_from, &set.ready))
         return NULL;
     int result = command_init(&set.ask, &ask, 0, &prefix);
@@ -455,13 +455,13 @@ static PyMethodDef RELAY_METHODS[] = {
     {"cut", Relay_cut, METH_NOARGS, NULL},
     {"resume", Relay_resume, METH_VARARGS, NULL},
     {"last_words", Relay_last_words, METH_O, NULL},
-    {"attach_bus", Relay_attach_bus, METH_O, NULL},
-    {"detach_bus", Relay_detach_bus, METH_NOARGS, NULL},
-    {"hold_bus", Relay_hold_bus, METH_O, NULL},
+    {"attach_interface", Relay_attach_interface, METH_O, NULL},
+    {"detach_interface", Relay_detach_interface, METH_NOARGS, NULL},
+    {"hold_interface", Relay_hold_interface, METH_O, NULL},
     {"set_gates", (PyCFunction)(void (*)(void))Relay_set_gates, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_queue", Relay_set_queue, METH_VARARGS, NULL},
     {"set_polling", Relay_set_polling, METH_VARARGS, NULL},
-    {"set_flow", (PyCFunction)(void (*)(void))Relay_set_flow, METH_VARARGS | METH_KEYWORDS, NULL},
+    {"set_level_window", (PyCFunction)(void (*)(void))Relay_set_level_window, METH_VARARGS | METH_KEYWORDS, NULL},
     {"command", (PyCFunction)(void (*)(void))Relay_command, METH_VARARGS | METH_KEYWORDS, NULL},
     {"events", Relay_events, METH_NOARGS, NULL},
     {"counters", Relay_counters, METH_NOARGS, NULL},

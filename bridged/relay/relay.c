@@ -231,7 +231,7 @@ void relay_last_words(struct relay *r, const uint8_t *words, size_t length)
 static void interface_lost(struct relay *r, int error)
 {
     let_go(r, &r->interface);
-    events_emit(&r->events, EVENT_BUS_LOST, (uint32_t)error, NULL, 0);
+    events_emit(&r->events, EVENT_INTERFACE_LOST, (uint32_t)error, NULL, 0);
 }
 
 /* Frames may wait in it, since the bridge before us had it: of those only their time stamps tell how old they are. */

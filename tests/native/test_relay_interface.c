@@ -142,7 +142,7 @@ static void test_down(unsigned frames)
     bench_receive(&b, frames, ENETDOWN, 1);
     CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_DOWN] == frames);
     CHECK(bench_counted(&b).pending == 0);
-    CHECK(!bench_told(&b, EVENT_BUS_LOST));
+    CHECK(!bench_told(&b, EVENT_INTERFACE_LOST));
     bench_receive(&b, frames, 0, 0);
     CHECK(bench_delivered(&b) == frames);
     bench_free(&b);
@@ -154,7 +154,7 @@ static void test_lost(unsigned frames, int error)
     struct bench b = bench_new();
     bench_receive(&b, frames, error, 1);
     CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_LOST] == frames);
-    CHECK(bench_told(&b, EVENT_BUS_LOST));
+    CHECK(bench_told(&b, EVENT_INTERFACE_LOST));
     bench_receive(&b, frames, 0, 0);
     CHECK(bench_counted(&b).counters.rx_dropped[RX_INTERFACE_LOST] == 2 * frames);
     CHECK(bench_delivered(&b) == 0);

@@ -76,7 +76,7 @@ class Rig:
         self.sent: list[Frame] = []  # by the device, on its bus
         self.received: list[bytes] = []  # from the relay, on the host's bus
         self.events: list[tuple[int, int, bytes]] = []
-        self.relay.attach_bus(self._near_bus)
+        self.relay.attach_interface(self._near_bus)
         self.relay.attach_port(self.near_port)
         self.perform(self.adapter.init_steps(None))
         self.open()
@@ -84,7 +84,7 @@ class Rig:
     def open(self) -> None:
         flow = self.adapter.flow
         assert flow is not None
-        self.relay.set_flow(
+        self.relay.set_level_window(
             flow.request, flow.prefix, capacity=flow.capacity, critical=flow.critical, ready=flow.ready
         )
         self.relay.set_gates(receiving=True, transmit=_relay.GATE_OPEN)

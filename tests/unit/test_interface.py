@@ -36,12 +36,12 @@ class Relay:
         self.bus = -1
         self.error = 0
 
-    def attach_bus(self, fd: int) -> None:
+    def attach_interface(self, fd: int) -> None:
         if self.error:
             raise OSError(self.error, os.strerror(self.error))
         self.bus = fd
 
-    def detach_bus(self) -> None:
+    def detach_interface(self) -> None:
         self.bus = -1
 
 

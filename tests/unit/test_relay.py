@@ -52,7 +52,7 @@ class Rig:
         for s in (self.port, far_port, self.bus, far_bus):
             s.setblocking(False)
         self.far = (far_port, far_bus)
-        self.relay.attach_bus(far_bus)
+        self.relay.attach_interface(far_bus)
         self.attach()
 
     def attach(self) -> None:
@@ -419,7 +419,7 @@ def test_bus_end_of_file_is_an_event_and_frames_are_counted(rig: Rig) -> None:
     rig.turn()
     rig.port.send(b"t1000\r")
     rig.turn()
-    assert (_relay.EVENT_BUS_LOST, 0, b"") in rig.events()
+    assert (_relay.EVENT_INTERFACE_LOST, 0, b"") in rig.events()
     assert rig.counters()["rx bus-lost"] == 1
 
 

@@ -51,10 +51,10 @@ class TestDescriptors:
         assert not hung_up(rig.bus)
         if end == "detach":
             rig.relay.detach_port()
-            rig.relay.detach_bus()
+            rig.relay.detach_interface()
         elif end == "attach another":
             others = socket.socketpair()
-            for attach, near in zip((rig.relay.attach_port, rig.relay.attach_bus), others, strict=True):
+            for attach, near in zip((rig.relay.attach_port, rig.relay.attach_interface), others, strict=True):
                 attach(near)
                 near.close()
         elif end == "lost":
@@ -67,7 +67,7 @@ class TestDescriptors:
         assert hung_up(rig.port)
         assert hung_up(rig.bus)
 
-    @pytest.mark.parametrize("attach", ["attach_port", "attach_bus"])
+    @pytest.mark.parametrize("attach", ["attach_port", "attach_interface"])
     def test_what_cannot_be_used_is_an_error_and_leaves_none_attached(
         self, rig: Rig, attach: str, tmp_path: Path
     ) -> None:
@@ -126,7 +126,7 @@ def relay_with(**options: object) -> Callable[[Rig], object]:
 
 
 def flow_with(**options: int) -> Callable[[Rig], object]:
-    return lambda rig: rig.relay.set_flow(b"\x0f", b"\x20", **(FLOW | options))
+    return lambda rig: rig.relay.set_level_window(b"\x0f", b"\x20", **(FLOW | options))
 
 
 def command_with(**options: object) -> Callable[[Rig], object]:
@@ -173,9 +173,9 @@ def test_a_relay_at_the_end_of_time(codec: str) -> None:
         for s in (near_port, near_bus):
             s.setblocking(False)
         relay.attach_port(near_port)
-        relay.attach_bus(near_bus)
+        relay.attach_interface(near_bus)
         if codec == "usb2can":
-            relay.set_flow(b"\x0f\x20\x01\x02", b"\x20", **FLOW)
+            relay.set_level_window(b"\x0f\x20\x01\x02", b"\x20", **FLOW)
         else:
             relay.set_polling(b"A\r", b"A", 999_999.0)
         relay.set_gates(receiving=True, transmit=_relay.GATE_OPEN)

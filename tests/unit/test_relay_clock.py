@@ -96,27 +96,27 @@ class TestFirst:
         self, rig: ClockRig, age: int, sent: bool
     ) -> None:
         rig.bus.send(can_frame(1))
-        rig.relay.attach_bus(rig.far[1])
+        rig.relay.attach_interface(rig.far[1])
         rig.turn_at(0, rig.oldest_stamp() + age * MS)
         assert rig.sent() == [1] * sent
         assert rig.counters()["stale"] == (not sent)
 
     def test_the_clock_is_set_back_before_the_first_look(self, rig: ClockRig) -> None:
         rig.bus.send(can_frame(1))
-        rig.relay.attach_bus(rig.far[1])
+        rig.relay.attach_interface(rig.far[1])
         rig.relay.turn(_relay.clock() + 700 * MS, rig.oldest_stamp() + 400 * MS)
         assert rig.counters()["stale"] == 1
 
     def test_what_was_known_of_the_socket_before_is_forgotten(self, rig: ClockRig) -> None:
         rig.turn_at(0, time.time_ns() - 5 * S)
         rig.bus.send(can_frame(1))
-        rig.relay.attach_bus(rig.far[1])
+        rig.relay.attach_interface(rig.far[1])
         rig.turn_at(100, rig.oldest_stamp() + 600 * MS)
         assert rig.counters()["stale"] == 1
 
 
 def test_an_old_frame_behind_a_young_one_is_not_sent(rig: ClockRig) -> None:
-    rig.relay.attach_bus(rig.far[1])
+    rig.relay.attach_interface(rig.far[1])
     rig.stamp(False)
     rig.bus.send(can_frame(1))
     rig.stamp(True)
