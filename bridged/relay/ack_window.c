@@ -31,15 +31,15 @@ void ack_window_reset(struct ack_window *w)
     w->refused_ns = NEVER;
 }
 
-/* Nobody knows any more whether the device took the frames that it seemed to refuse. */
+/* Drops the refused frames: the device may have taken them after all. */
 static void refused_unanswered(struct ack_window *w)
 {
     for (; w->queue->retry_count; queue_retry_pop(w->queue))
         queue_drop(w->queue, TX_UNANSWERED);
 }
 
-/* With a window above 1 and an answer missing, a refusal may have been another frame's. What was
- * refused while anything is still in flight is not sent again. */
+/* With a window above 1 and an answer missing, a refusal may have been meant for another frame. So frames refused
+ * while anything is still in flight are not sent again. */
 void ack_window_answer_missing(struct ack_window *w)
 {
     if (w->line->window > 1 && w->line->inflight_count)
@@ -86,7 +86,7 @@ bool ack_window_take_late(struct ack_window *w)
     return true;
 }
 
-/* Where the device's buffer is full and takes nothing for so long, nothing has left it either. */
+/* A device that has been refusing every frame for so long has a full buffer that no frame leaves. */
 static void look_if_stuck(struct ack_window *w, int64_t now)
 {
     if (w->refused_ns == NEVER)

@@ -9,7 +9,7 @@ struct ack_window {
     struct queue *queue;
     struct line *line;
     int64_t retry_at_ns, retry_delay_ns;
-    int64_t refused_ns;   /* since when the device takes no frame; NEVER: it does */
+    int64_t refused_ns;   /* when the device began to refuse every frame; NEVER: it took the last one */
     bool checking;        /* refusals are not certain yet: the sync command goes next, or is in flight */
     uint64_t check_noise; /* line_noise() at the first of these refusals */
 };

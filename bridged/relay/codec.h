@@ -29,7 +29,7 @@ struct codec_message {
     size_t length;         /* CODEC_TEXT: length in bytes. CODEC_SKIPPED: how many bytes are skipped */
 };
 
-/* What no codec exceeds, so that buffers have their size; each asserts it of its own. */
+/* No codec exceeds these, so buffers have their sizes; each codec asserts its own. */
 enum {
     CODEC_LINE_MAX = 256, /* line_max */
     CODEC_FRAME_MAX = 64, /* frame_max */
@@ -37,7 +37,7 @@ enum {
 
 enum { CODEC_KEPT_MAX = 20 }; /* bytes of the longest message of a binary protocol */
 
-/* What a decoder must remember between two calls; zero it to start. */
+/* A decoder's memory between two calls; zero it to start. */
 struct codec_state {
     bool doubt; /* not certain where messages begin: a frame counts once something valid follows it */
     bool quiet; /* set by the caller: nothing has come for quiet_ns, decide with what there is */

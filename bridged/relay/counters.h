@@ -1,4 +1,4 @@
-/* What the relay counts, why it drops frames, and what it tells Python.
+/* The lists of the relay's counters, of its reasons to drop a frame, and of its events for Python.
  *
  * A new one is a line in one of these lists: X(NAME, "its name in Python", "what it means").
  * The enumerators, the struct, Python's constants and the keys of counters() come from them, and a test holds the
@@ -29,7 +29,7 @@
     X(RX_INTERFACE_DOWN, "bus-down", "the interface is down (ENETDOWN)") \
     X(RX_INTERFACE_LOST, "bus-lost", "the interface is gone, or none is attached")
 
-/* What events() returns. The name in Python is that of the enumerator. */
+/* The kinds of event that events() returns. The name in Python is that of the enumerator. */
 #define EVENT_LIST(X) \
     X(EVENT_OK, "a command was answered \"done\"") \
     X(EVENT_REFUSED, "a command was refused") \

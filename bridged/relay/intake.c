@@ -90,7 +90,8 @@ static void take_message(struct intake *in, int i, int64_t offset, int64_t now)
 
 /* Reads a batch in the turn that began at `turn`. `live`: time has gone on since; `now` becomes that time.
  * EINTR: epoll tells when. EAGAIN, or fewer frames than asked for: the socket was empty. ENETDOWN: the interface went
- * down; said, the socket stays. It may have cut short the batch before, so nothing is known of the socket any more.
+ * down, which is an event; the socket stays. That may have cut short the batch before, so nobody knows any more since
+ * when the socket is empty.
  * An empty message is the end of a socketpair. Anything else: the interface is gone.
  * -> 0, or errno or INTAKE_END of an interface that is gone */
 int intake_read(struct intake *in, int interface, struct moment turn, bool live, int64_t *now)

@@ -1,7 +1,7 @@
 /* The window of a device that does not answer frames.
  *
  * Frames are followed by a question (set.ask). Its answer comes after the device has dealt with all frames
- * before it: those are taken now, unless they were handed back first. It also tells how full the device's
+ * before it: those are taken now, unless they were handed back first. The answer also tells how full the device's
  * buffer is, or at least that it was not full enough for a "stop". So never more frames are on their way
  * than surely fit: a frame that comes back while later ones are taken could not be put in order again. */
 #include "level_window.h"

@@ -41,11 +41,11 @@ static void out_cut(struct line *l)
     l->out_until_ns = NEVER;
 }
 
-/* The port is gone or new. What is in flight is the caller's, to be taken before. */
+/* The port is gone or new. The caller has taken everything out of flight before. */
 void line_reset(struct line *l)
 {
     out_cut(l);
-    l->resyncing = l->silent = l->late_answer_possible = false;
+    l->resyncing = l->silent = false;
 }
 
 struct cut line_cut(const struct line *l)
@@ -69,7 +69,7 @@ void line_forget(struct line *l)
     l->out_start = l->out_end = 0;
 }
 
-/* Puts these bytes behind what is in `out`, whoever answers them. -> whether there is room */
+/* Puts these bytes into `out`; nobody waits for an answer. -> whether there is room */
 bool line_say(struct line *l, const uint8_t *words, size_t length)
 {
     if (length > OUT_BUFFER - l->out_end)
@@ -187,7 +187,6 @@ static int send_sync(struct line *l, int64_t now)
 int line_resync(struct line *l, int64_t now)
 {
     l->resyncing = true;
-    l->late_answer_possible = false;
     l->sync_tries = 1;
     l->counters->resyncs++;
     events_emit(l->events, EVENT_UNANSWERED, (uint32_t)l->counters->resyncs, NULL, 0);

@@ -50,7 +50,6 @@ struct line {
     uint32_t inflight_head, inflight_count;
     bool resyncing;
     bool silent; /* the device answered no sync command: nothing is sent until the next attach */
-    bool late_answer_possible; /* a command timed out; resync before sending the first frame */
     uint32_t sync_tries;
 };
 
@@ -84,6 +83,12 @@ static inline const struct inflight *line_at(const struct line *l, uint32_t i)
 static inline uint64_t line_noise(const struct line *l)
 {
     return l->counters->skipped_bytes + l->counters->stray_answers;
+}
+
+/* Whether the port has not taken all of `out`. */
+static inline bool line_waits_for_port(const struct line *l)
+{
+    return l->out_start < l->out_end;
 }
 
 /* Whether one more command or frame fits into `out`. */

@@ -94,7 +94,7 @@ static int command_init(struct command *c, const Py_buffer *data, int accept, co
     return 0;
 }
 
-/* What Python says of the queue. -> 0, or -1 with an exception */
+/* Settings of the queue as Python gives them. -> 0, or -1 with an exception */
 static int queue_settings_from(struct queue_settings *set, uint32_t size, double deadline, double stuck)
 {
     if (size < 1 || size > QUEUE_MAX || !seconds_valid(deadline) || !seconds_valid(stuck)) {

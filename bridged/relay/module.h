@@ -1,4 +1,4 @@
-/* What the files that know Python share. */
+/* Shared by the files that know Python. */
 #ifndef CAN_BRIDGE_MODULE_H
 #define CAN_BRIDGE_MODULE_H
 

@@ -25,7 +25,7 @@ void receive_init(struct receive *rc, struct transmit *transmit)
     }
 }
 
-/* The port is gone. What it said in part is noise. */
+/* The port is gone. A message of which only a part has come is noise. */
 void receive_reset(struct receive *rc)
 {
     rc->receiving = rc->stamp_seen = false;
@@ -36,6 +36,12 @@ void receive_reset(struct receive *rc)
     rc->counters->skipped_messages++;
     rc->counters->skipped_bytes += rc->in_length;
     rc->in_length = 0;
+}
+
+/* Whether frames are wanted; else they are dropped. */
+void receive_set(struct receive *rc, bool receiving)
+{
+    rc->receiving = receiving;
 }
 
 /* --- to the interface ------------------------------------------------------------------------ */
@@ -188,7 +194,8 @@ int receive_decode(struct receive *rc, int interface, int64_t now)
     return error;
 }
 
-/* What is due without any input. -> 0, or errno of an interface that is gone */
+/* Does what is due without any input: frames that the interface had no room for, bytes that wait for more.
+ * -> 0, or errno of an interface that is gone */
 int receive_due(struct receive *rc, int interface, int64_t now)
 {
     int error = rc->retry_at_ns <= now ? batch_flush(rc, interface, now) : 0;

@@ -132,7 +132,7 @@ struct relay *relay_new(const struct settings *set)
     struct relay *r = calloc(1, sizeof *r);
     if (!r)
         return NULL;
-    r->port = r->interface = r->wake_fd = r->epoll_fd = r->events.fd = -1;
+    r->port = r->interface = r->wake_fd = r->epoll_fd = -1;
     int error = init(r, set);
     if (error) {
         relay_free(r);
@@ -279,7 +279,7 @@ void relay_hold_interface(struct relay *r, bool held)
 void relay_set_gates(struct relay *r, bool receiving, enum gate gate)
 {
     lock(r);
-    r->receive.receiving = receiving;
+    receive_set(&r->receive, receiving);
     queue_set_gate(&r->queue, gate);
     unlock_wake(r);
 }
@@ -368,7 +368,7 @@ static int64_t next_deadline(struct relay *r)
 /* Waits for room in the port as long as there is something for it. */
 static void watch_room(struct relay *r)
 {
-    bool full = r->line.out_start < r->line.out_end;
+    bool full = line_waits_for_port(&r->line);
     if (r->port < 0 || full == r->port_full)
         return;
     r->port_full = full;
@@ -389,7 +389,7 @@ static long wait_epoll(int epoll_fd, struct epoll_event ready[SOURCES], int64_t 
     return epoll_wait(epoll_fd, ready, SOURCES, ns == NEVER ? -1 : ms > INT_MAX ? INT_MAX : (int)ms);
 }
 
-/* Waits without the lock until something is there or `until` has come; says which sources are ready.
+/* Waits without the lock until something is there or `until` has come; returns which sources are ready.
  * `turn`: the time of the turn before: where the interface is not ready, its socket was empty after that. */
 static unsigned int wait_ready(struct relay *r, struct moment turn, int64_t until)
 {
@@ -453,7 +453,8 @@ static void send_waiting(struct relay *r, int64_t now)
         port_lost(r, error);
 }
 
-/* What has come is handled, what may go is sent. `at` is the time of this turn; `live`: it goes on meanwhile. */
+/* One turn: takes what has come, then sends what may go. `at`: when it began; `live`: time goes on meanwhile.
+ * -> when the next turn is due */
 static int64_t turn(struct relay *r, unsigned int ready, struct moment at, bool live)
 {
     int64_t now = at.boot_ns;

@@ -1,4 +1,4 @@
-/* What goes to the device next, and what answers do to it. */
+/* Decides which command, poll or frame goes to the device next, and hands each answer to whom it concerns. */
 #include "transmit.h"
 
 #include <errno.h>
@@ -39,7 +39,7 @@ static void oldest_answered(struct transmit *t, enum event_kind how, const struc
         break;
     case INFLIGHT_COMMAND:
         if (how == EVENT_TEXT)
-            t->line->late_answer_possible = false;
+            t->late_answer_possible = false;
         events_emit(t->events, how, done.token, msg->text, msg->length);
         break;
     case INFLIGHT_POLL:
@@ -144,7 +144,7 @@ void transmit_reset(struct transmit *t)
         events_emit(t->events, EVENT_TIMEOUT, t->commands[t->command_head].token, NULL, 0);
         t->command_head = (t->command_head + 1) % COMMANDS_MAX;
     }
-    t->polling = t->polled = false;
+    t->polling = t->polled = t->late_answer_possible = false;
     t->poll.length = 0;
     line_reset(t->line);
     ack_window_reset(t->ack);
@@ -187,6 +187,7 @@ void transmit_poll(struct transmit *t, const struct command *poll, int64_t inter
 static int resync(struct transmit *t, int64_t now)
 {
     answer_missing(t);
+    t->late_answer_possible = false;
     return line_resync(t->line, now);
 }
 
@@ -222,9 +223,9 @@ static int look_for_missing(struct transmit *t, int64_t now)
             oldest_unanswered(t);
         if (kept || live)
             return resync(t, now);
-        l->late_answer_possible = true;
+        t->late_answer_possible = true;
     }
-    if (l->late_answer_possible && t->queue->gate == GATE_OPEN && !l->inflight_count)
+    if (t->late_answer_possible && t->queue->gate == GATE_OPEN && !l->inflight_count)
         return resync(t, now);
     return 0;
 }
@@ -302,7 +303,7 @@ bool transmit_idle(const struct transmit *t)
 {
     const struct line *l = t->line;
     bool waiting = t->queue->waiting_count || t->queue->retry_count || t->command_count;
-    bool owed = l->inflight_count || l->out_end || l->late_answer_possible || t->ack->checking || l->resyncing;
+    bool owed = l->inflight_count || l->out_end || t->late_answer_possible || t->ack->checking || l->resyncing;
     bool taken = t->level->sent_count || t->level->level;
     return !waiting && !owed && !taken && !t->poll.length;
 }

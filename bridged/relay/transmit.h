@@ -1,4 +1,4 @@
-/* What goes to the device next: a command, a poll or a frame; and what becomes of each. */
+/* Decides which command, poll or frame goes to the device next, and hands each answer to whom it concerns. */
 #ifndef CAN_BRIDGE_TRANSMIT_H
 #define CAN_BRIDGE_TRANSMIT_H
 
@@ -22,6 +22,7 @@ struct transmit {
     uint64_t poll_decoded; /* counters.decoded when the last poll was sent */
     bool polling;          /* one is in flight */
     bool polled;           /* since the last frame: a frame goes before the next poll */
+    bool late_answer_possible; /* a command timed out; resync before sending the first frame */
 };
 
 void transmit_init(struct transmit *t, struct queue *queue, struct line *line, struct ack_window *ack,

@@ -1,4 +1,4 @@
-/* What the relay and its owner (module*.c) hand each other: plain values. */
+/* Plain values that the relay and its owner (module*.c) hand each other. */
 #ifndef CAN_BRIDGE_VALUES_H
 #define CAN_BRIDGE_VALUES_H
 
@@ -19,7 +19,7 @@ enum {
     EVENTS_MAX = 256,  /* events that Python has not fetched yet */
 };
 
-/* What happens to frames read from the interface. */
+/* Frames read from the interface are sent (GATE_OPEN), or dropped with the reason of this name. */
 enum gate { GATE_AWAY, GATE_OPEN, GATE_LISTEN_ONLY, GATE_STOPPED, GATES };
 
 /* Answers that settle a command; a text settles it when it begins with the command's prefix, if it has one. */

@@ -62,6 +62,13 @@ def test_only_relay_c_knows_what_a_relay_is() -> None:
     assert with_it == ["relay.c"]
 
 
+def test_a_part_changes_no_struct_but_its_own() -> None:
+    """The counters are everybody's."""
+    parts = "queue|line|ack|level|transmit|receive|intake|events"
+    write = re.compile(rf"(?:->|\.)(?:{parts})(?:->|\.)\w+(?:\[\w+\])? ?(?:[-+*|]?=[^=]|\+\+|--)")
+    assert [path.name for path in files() if write.search(path.read_text())] == []
+
+
 def test_the_build_has_each_file_of_the_relay() -> None:
     (module,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["ext-modules"]
     names = [path.relative_to(ROOT).as_posix() for path in files()]
