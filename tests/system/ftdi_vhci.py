@@ -31,8 +31,10 @@ FREE = "004"  # VDEV_ST_NULL
 
 PACKET = 64
 STATUS = b"\x01\x60"
+FIFO = 128  # bytes from the host that the device has not read
 GET_DESCRIPTOR = (0x80, 6)
 GET_CONFIGURATION = (0x80, 8)
+RESET, PURGE_FROM_HOST = (0x40, 0), (0, 1)  # all, or what came from the host and was not read
 SET_LATENCY = (0x40, 9)
 GET_LATENCY = (0xC0, 10)
 
@@ -65,6 +67,11 @@ class FakeFt245:
         self._received = bytearray()
         self._to_send = bytearray()
         self._reads: list[tuple[int, int, float]] = []  # sequence number, length, when it is answered at last
+        self.may_read: int | None = None  # so many bytes more the device reads; None: all that come
+        self._fifo = b""
+        self._writes: list[
+            tuple[int, bytes, int]
+        ] = []  # sequence number, what is not in the FIFO yet, length
         self._lock = threading.Lock()
         self._port = -1
         endpoints = struct.pack("<BBBBHB", 7, 5, 0x81, 2, PACKET, 0) + struct.pack(
@@ -98,6 +105,8 @@ class FakeFt245:
 
     def plug(self) -> None:
         self._reads.clear()
+        self._writes.clear()
+        self._fifo, self.may_read = b"", None
         self._to_send.clear()
         self.heard_all_at = time.time()
         ours, theirs = socket.socketpair()
@@ -146,7 +155,7 @@ class FakeFt245:
             if line.fileno() in ready and not self._take(line):
                 break
             self._work()
-            if not self._answer_reads(line):
+            if not self._accept_writes(line) or not self._answer_reads(line):
                 break
         line.close()
 
@@ -160,6 +169,32 @@ class FakeFt245:
             self._reads = [(other, size, later) for other, size, _ in self._reads]
         return True
 
+    def reads(self, more: int | None) -> None:
+        """The device reads so many bytes more from now on; None: all that come."""
+        self.may_read = more
+        self._awake()
+
+    def _accept_writes(self, line: socket.socket) -> bool:
+        """What the host writes goes on as far as there is room, packet by packet; False: unplugged."""
+        self._device_reads()
+        while self._writes and len(self._fifo) + min(PACKET, len(self._writes[0][1])) <= FIFO:
+            sequence, data, length = self._writes.pop(0)
+            self._fifo += data[:PACKET]
+            self._device_reads()
+            if data[PACKET:]:
+                self._writes.insert(0, (sequence, data[PACKET:], length))
+            elif not self._reply(line, sequence, length=length):
+                return False
+        return True
+
+    def _device_reads(self) -> None:
+        read = self._fifo if self.may_read is None else self._fifo[: self.may_read]
+        self._fifo = self._fifo[len(read) :]
+        if self.may_read is not None:
+            self.may_read -= len(read)
+        if read:
+            self._arrived(read)
+
     def _idle_until(self) -> float:
         return time.monotonic() + max(self.latency_ms / 1000, self._idle_s)
 
@@ -170,9 +205,15 @@ class FakeFt245:
             return False
         command, sequence, _, direction, endpoint, flags, length, *_, setup = SUBMIT.unpack(header)
         if command == CMD_UNLINK:  # in its place of the flags is which one
-            waiting = len(self._reads)
+            waiting = len(self._reads) + len(self._writes)
+            begun = [write for write in self._writes if write[0] == flags and len(write[1]) < write[2]]
             self._reads = [read for read in self._reads if read[0] != flags]
-            status = UNLINKED if len(self._reads) < waiting else 0
+            self._writes = [write for write in self._writes if write[0] != flags]
+            status = UNLINKED if len(self._reads) + len(self._writes) < waiting else 0
+            for _, rest, size in begun:  # it has ended, then: only so the host hears how many bytes went
+                status = 0
+                if not self._reply(line, flags, length=size - len(rest)):
+                    return False
             return send(line, RESULT.pack(RET_UNLINK, sequence, 0, 0, 0, status, 0, 0, 0, 0))
         data = receive(line, length) if direction != DIRECTION_IN else b""
         if data is None:
@@ -187,8 +228,8 @@ class FakeFt245:
         if direction == DIRECTION_IN:
             self._reads.append((sequence, length, self._idle_until()))
             return True
-        self._arrived(data)
-        return self._reply(line, sequence, length=length)
+        self._writes.append((sequence, data, length))
+        return True
 
     @staticmethod
     def _reply(
@@ -222,6 +263,8 @@ class FakeFt245:
             return bytes(length) if kind & 0x80 else b""
         if kind & 0x80 == 0:
             self.requests.append((kind, request, value, index))
+        if (kind, request) == RESET and value in PURGE_FROM_HOST:
+            self._fifo = b""
         if (kind, request) == SET_LATENCY:
             self.latency_ms = value & 0xFF
         return (

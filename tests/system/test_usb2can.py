@@ -253,6 +253,42 @@ def test_chip_that_sends_empty_packets(rig: Rig, raw: bool) -> None:
         wait_terminal(FAKE)
 
 
+@BOTH_PORTS
+def test_a_device_that_stops_reading_in_the_middle_of_a_frame(rig: Rig, raw: bool) -> None:
+    """When it reads on, it finds the rest, and no frame with the bytes of a command; also after a stop."""
+    near, frames = rig.vcan(), mixed_frames(400, seed=4)
+    with plugged("usb2can", FAKE) as chip:
+        settings = configuration(address(FAKE, raw=raw), near, deadline=0.5)
+        for bytes_read in (23, 150, 401):
+            bridge = rig.bridge(settings)
+            for _ in range(2):
+                bridge.wait_state("running")
+                chip.reads(bytes_read)
+                assert rig.play(near, frames).wait() == 0
+                bridge.wait_state("backoff")
+                chip.reads(None)
+            bridge.wait_state("running")
+            bridge.stop_cleanly()
+        with chip.device() as device:
+            assert device.violations == []
+        assert len(chip.life.sent) > 3
+        assert [frame for frame in chip.life.sent if frame not in frames] == []
+
+
+@BOTH_PORTS
+def test_a_device_that_reads_nothing_delays_no_stop(rig: Rig, raw: bool) -> None:
+    near = rig.vcan()
+    with plugged("usb2can", FAKE) as chip:
+        bridge = rig.bridge(configuration(address(FAKE, raw=raw), near))
+        bridge.wait_state("running")
+        chip.reads(23)
+        assert rig.play(near, mixed_frames(400, seed=4)).wait() == 0
+        begin = time.monotonic()
+        bridge.stop_cleanly()
+        assert time.monotonic() - begin < 10.0, "20 times slower than it is"
+        chip.reads(None)
+
+
 def test_listen_only_with_a_filter(rig: Rig) -> None:
     chip, near, far = rig.chip("ftdi1"), rig.vcan(), rig.vcan()
     settings = configuration(address(chip.serial_number, raw=True), near)
