@@ -223,6 +223,7 @@ class Usb2can:
             case 3, 0:
                 self._mode = self.NORMAL
             case 6, 0:
+                self.questions += 1
                 say(message(6, self._mode))
             case 33, 0:
                 say(message(33, *b"HW0003FW0016"))
@@ -240,7 +241,6 @@ class Usb2can:
                 self._looks += 1
                 say(message(32, 128, self._critical, self._ready, self.waiting, 0))
             case 96, 0:
-                self.questions += 1
                 say(message(96, 0))
             case 97, 0:
                 say(message(97, 0))
