@@ -76,9 +76,12 @@ static void bench_free(struct bench *b)
 static void bench_receive(struct bench *b, unsigned frames, int error, int times)
 {
     static const char line[] = "t1231AA\r";
-    for (unsigned i = 0; i < frames; i++)
-        if (write(b->port, line, sizeof line - 1) != sizeof line - 1)
-            abort();
+    char lines[300 * (sizeof line - 1)];
+    size_t n = 0;
+    for (unsigned i = 0; i < frames; i++, n += sizeof line - 1)
+        memcpy(lines + n, line, sizeof line - 1);
+    if (n && write(b->port, lines, n) != (ssize_t)n)
+        abort();
     next_error = error;
     error_count = times;
     b->now += 1000;
@@ -171,5 +174,6 @@ int main(void)
         test_lost(frames, ENXIO);
         test_lost(frames, ENODEV);
     }
+    test_lost(300, ENXIO); /* in the middle of what was read: more than one batch */
     return checks_end();
 }

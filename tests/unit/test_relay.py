@@ -489,3 +489,37 @@ def test_random_device_never_sees_a_frame_twice_late_or_out_of_order(
         assert taken == sorted(set(taken))
         assert c["tx_frames"] <= len(taken) <= c["tx_frames"] + c["unanswered"] + c["queued"]
         assert c["bus_read"] == sent
+
+
+def test_what_waits_grows_too_old_while_the_port_is_away() -> None:
+    rig = Rig(deadline=0.1)
+    for number in range(3):
+        rig.bus.send(can_frame(number))
+    rig.turn()
+    born = rig.now
+    rig.relay.detach_port()
+    assert rig.turn() == born + 100 * MS + 1
+    rig.turn(101)
+    assert rig.counters()["stale"] == 2
+    assert rig.counters()["queued"] == 0
+    rig.close()
+
+
+def test_a_queue_full_of_old_frames_has_room_for_a_new_one() -> None:
+    rig = Rig(queue=2, deadline=0.1)
+    for number in range(3):
+        rig.bus.send(can_frame(number))
+        rig.turn()
+    assert rig.counters()["queued"] == 3  # one of them in flight
+    rig.bus.send(can_frame(3))
+    rig.turn(101)
+    assert (rig.counters()["stale"], rig.counters()["queue-full"]) == (2, 0)
+    rig.close()
+
+
+def test_time_stamps_are_told_again_of_a_new_port(rig: Rig) -> None:
+    for _ in range(2):
+        rig.port.send(b"t12311155AA\r" * 2)
+        rig.turn()
+        assert [kind for kind, _, _ in rig.events()].count(_relay.EVENT_STAMPED) == 1
+        rig.attach()
