@@ -12,6 +12,7 @@ import os
 import queue
 import threading
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
@@ -23,7 +24,7 @@ from bridged.bridge.backoff import Backoff, chance
 from bridged.bridge.exchanges import REPLIES, Exchanges
 from bridged.bridge.interface import BusEnd
 from bridged.bridge.kept_port import KeptPort
-from bridged.bridge.lifecycle import Action, Event, State, transition
+from bridged.bridge.lifecycle import Action, Event, State, Verdict, transition
 from bridged.bridge.log_limiter import LogLimiter, repeated
 from bridged.bridge.polling import NOISE, NOISE_CAUSES, HealthPolling
 from bridged.bridge.recovery import BusOff, stuck_s
@@ -85,6 +86,9 @@ class Bridge:
         self.config = config
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
+        self._pending: deque[Verdict] = deque()  # not acted upon yet, but for the first: that is under way
+        self._pause_s: float | None = None  # the next one, if the back-off does not decide
+        self._restarts = False  # it left its bus because of bus-off and has not run since
         self.circle = ""  # what neighbours.py has found
         self._told = LogLimiter()
         self.finished = False
@@ -131,7 +135,7 @@ class Bridge:
             config.health.interval_s,
             ask=self._exchanges.ask,
             tell=self._bus_end.put_error_frame,
-            failed=lambda reason: self._dispatch(Event.SILENT, reason),
+            failed=lambda reason: self._dispatch(Verdict(Event.SILENT, reason)),
             bus_off=self._on_bus_off,
             stuck_s=stuck_s(config),
             tally=self._relay.tally,
@@ -187,7 +191,7 @@ class Bridge:
             self._look_again_at = now + HAND_OVER_LOOK_S
             return
         self._stop_by = self._look_again_at = None
-        self._dispatch(Event.STOP)
+        self._dispatch(Verdict(Event.STOP))
 
     def filenos(self) -> tuple[int, ...]:
         watch = (self._watch.fd,) if self._watch.fd >= 0 else ()
@@ -205,7 +209,7 @@ class Bridge:
         if self.state in LOOKING_OUT and self._watch.has_come():
             log.info("%s was plugged in", self.config.adapter.port)
             self._plugged_in = True
-            self._dispatch(Event.APPEARED)
+            self._dispatch(Verdict(Event.APPEARED))
 
     def next_timer(self) -> float | None:
         parts = (self._bus_end, self._polling, self._exchanges, self._sharing)
@@ -215,11 +219,11 @@ class Bridge:
     def on_timer(self, now: float) -> None:
         if self._timer is not None and self._timer <= now:
             self._timer = None
-            self._dispatch(Event.TIMER)
+            self._dispatch(Verdict(Event.TIMER))
         if self._look_again_at is not None and self._look_again_at <= now:
             self._stop_when_sent()
         if self._bus_end.on_timer(now):
-            self._dispatch(Event.RESTART)
+            self._dispatch(Verdict(Event.RESTART))
         self._start_with_bus()
         self._polling.on_timer(now)
         self._exchanges.on_timer(now)
@@ -252,7 +256,7 @@ class Bridge:
         if self.state in LOOKING_OUT and self._timer is not None:
             self._timer = min(self._timer, now + self._backoff.next_s(now))
         if channel.restart_s is not None:
-            self._dispatch(Event.RESTART)
+            self._dispatch(Verdict(Event.RESTART))
         if self._polling.health.state is BusState.BUS_OFF:
             self._on_bus_off("bus-off")
         return True
@@ -332,17 +336,32 @@ class Bridge:
 
     def _start_with_bus(self) -> None:
         if self.state is State.IDLE and self._bus_end.bus is not None:
-            self._dispatch(Event.START)
+            self._dispatch(Verdict(Event.START))
 
     # --- lifecycle ----------------------------------------------------------------------------
 
-    def _dispatch(self, event: Event, reason: str = "") -> None:
+    def _dispatch(self, verdict: Verdict) -> None:
+        """Acts on it, and on what that leads to, one after the other.
+
+        An event that an action leads to waits until all actions before it are done: nothing re-enters.
+        """
+        self._pending.append(verdict)
+        if len(self._pending) > 1:
+            return
+        while self._pending:
+            self._transit(self._pending[0])
+            self._pending.popleft()
+
+    def _transit(self, verdict: Verdict) -> None:
         before = self.state
-        self.state, actions = transition(before, event)
-        if event is Event.CLOSED:
+        self.state, actions = transition(before, verdict.event)
+        if verdict.event is Event.CLOSED:
             self.channel_open = self._exchanges.last_reply is Reply.NONE
+        if before is State.RUNNING and self.state is not before:
+            self._pause_s = verdict.pause_s
+            self._restarts = self._restarts or verdict.off_bus
         if self.state is not before:
-            self._log_transition(reason)
+            self._log_transition(verdict.reason)
         for action in actions:
             self._perform(action)
         if self._holds_bus and self.state not in COMING_UP:
@@ -362,7 +381,7 @@ class Bridge:
         times = self._told.tell(reason, now) if reason else None
         if times is not None:
             again = ""
-            if self.state in {State.CLOSING, State.BACKOFF} and not self._bus_off.sets_pause:
+            if self.state in {State.CLOSING, State.BACKOFF} and self._pause_s is None:
                 again = f"; trying again in {self._backoff.coming_s(now):.2g} s"
             log.warning("state=%s: %s%s%s", self.state.value, reason, again, repeated(times))
             return
@@ -405,7 +424,7 @@ class Bridge:
             case Action.RELEASE:
                 self._release()
             case Action.WAIT:
-                pause_s = self._bus_off.take_pause_s()
+                pause_s, self._pause_s = self._pause_s, None
                 self._wait(self._backoff.next_s(time.monotonic()) if pause_s is None else pause_s)
             case Action.WAIT_LONG:
                 self._wait(self._backoff.longest_s())
@@ -422,7 +441,7 @@ class Bridge:
         """Looks again now and then: what is no device of the kernel's (a pty) comes without an event."""
         self._wait(self._backoff.next_s(time.monotonic()))
         if self._watch.is_there():
-            self._dispatch(Event.APPEARED)
+            self._dispatch(Verdict(Event.APPEARED))
 
     def _open_port(self) -> None:
         result: Port | Exception
@@ -445,10 +464,10 @@ class Bridge:
             if not self.finished:
                 self._watch.arm()  # before the look, or it might come between
             there = self._watch.is_there()
-            self._dispatch(Event.OPEN_FAILED if there else Event.ABSENT, str(result))
+            self._dispatch(Verdict(Event.OPEN_FAILED if there else Event.ABSENT, str(result)))
             if there and self._plugged_in and self.state is State.BACKOFF:
                 self._plugged_in = False  # it was opened in the middle of that, and is not told again
-                self._dispatch(Event.APPEARED)
+                self._dispatch(Verdict(Event.APPEARED))
             return
         if isinstance(result, Exception):
             raise result
@@ -457,13 +476,14 @@ class Bridge:
             self._relay.attach_port(result.fd)
         except OSError as error:  # no descriptor is left for it
             self._kept.put_back(result)
-            self._dispatch(Event.OPEN_FAILED, f"{self._path}: cannot be used: {error.strerror}")
+            reason = f"{self._path}: cannot be used: {error.strerror}"
+            self._dispatch(Verdict(Event.OPEN_FAILED, reason))
             return
         self._port = result
         self._watch.opened(result.fd)
         self._sharing.opened(result.description, time.monotonic())
         self._kept.resume()
-        self._dispatch(Event.OPENED)
+        self._dispatch(Verdict(Event.OPENED))
 
     def _run(self) -> None:
         self._backoff.runs(time.monotonic())
@@ -479,7 +499,8 @@ class Bridge:
         listen_only = self.config.channel.listen_only
         gate = _relay.GATE_LISTEN_ONLY if listen_only else _relay.GATE_OPEN
         self._relay.set_gates(receiving=True, transmit=gate)
-        self._polling.start(time.monotonic(), restarted=self._bus_off.take_restarting())
+        self._polling.start(time.monotonic(), restarted=self._restarts)
+        self._restarts = False
         self._starts += 1
         identity = self.adapter.identity
         if identity != self._identity:
@@ -570,11 +591,10 @@ class Bridge:
             self._exchanges.answer(kind, token, text)
         elif kind == _relay.EVENT_PORT_LOST:
             failure = self._port.failure if self._port else None
-            self._dispatch(
-                Event.PORT_LOST, f"port {self.config.adapter.port} lost: {failure or _reason(token)}"
-            )
+            reason = f"port {self.config.adapter.port} lost: {failure or _reason(token)}"
+            self._dispatch(Verdict(Event.PORT_LOST, reason))
         elif kind == _relay.EVENT_SILENT:
-            self._dispatch(Event.SILENT, "the adapter stopped answering")
+            self._dispatch(Verdict(Event.SILENT, "the adapter stopped answering"))
         elif kind == _relay.EVENT_UNANSWERED:
             self._on_unanswered(token)
         elif kind == _relay.EVENT_STUCK:

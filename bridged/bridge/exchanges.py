@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bridged import _relay
 from bridged.adapters.base import Answer, Reply
-from bridged.bridge.lifecycle import Event
+from bridged.bridge.lifecycle import Event, Verdict
 from bridged.errors import AdapterError, WrongDeviceError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class Exchanges:
     `dispatch` is told how a procedure ended: the event that it was to end with, REFUSED or UNANSWERED.
     """
 
-    def __init__(self, relay: _relay.Relay, dispatch: Callable[[Event, str], None]) -> None:
+    def __init__(self, relay: _relay.Relay, dispatch: Callable[[Verdict], None]) -> None:
         self._relay = relay
         self._dispatch = dispatch
         self._tokens = itertools.count(1)
@@ -88,11 +88,11 @@ class Exchanges:
             exchange = steps.send(answer) if answer else next(steps)
         except StopIteration:
             self._steps = None
-            self._dispatch(self._end, "")
+            self._dispatch(Verdict(self._end))
         except WrongDeviceError as error:
-            self._dispatch(Event.REFUSED, str(error))
+            self._dispatch(Verdict(Event.REFUSED, str(error)))
         except AdapterError as error:
-            self._dispatch(Event.UNANSWERED, str(error))
+            self._dispatch(Verdict(Event.UNANSWERED, str(error)))
         else:
             if not exchange.request:
                 self.next_at = time.monotonic() + exchange.timeout_s
@@ -106,9 +106,9 @@ class Exchanges:
             return
         advice = f": {exchange.advice}" if exchange.advice else ""
         if answer.reply is Reply.REFUSED:
-            self._dispatch(Event.REFUSED, f"the adapter refused to {exchange.purpose}{advice}")
+            reason = f"the adapter refused to {exchange.purpose}{advice}"
+            self._dispatch(Verdict(Event.REFUSED, reason))
         else:
             wait = f"within {exchange.timeout_s:.2g} s"
-            self._dispatch(
-                Event.UNANSWERED, f"the adapter did not answer the request to {exchange.purpose} {wait}"
-            )
+            reason = f"the adapter did not answer the request to {exchange.purpose} {wait}"
+            self._dispatch(Verdict(Event.UNANSWERED, reason))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from typing import NamedTuple
 
 
 class State(enum.Enum):
@@ -42,6 +43,15 @@ class Event(enum.Enum):
     CLOSED = enum.auto()  # the closing steps are done, whatever they met
     TIMER = enum.auto()
     STOP = enum.auto()
+
+
+class Verdict(NamedTuple):
+    """An event and its data: what a part of the bridge found, for bridge.py to act on."""
+
+    event: Event
+    reason: str = ""
+    pause_s: float | None = None  # before the next try; None: the back-off decides
+    off_bus: bool = False  # the adapter leaves its CAN bus because of bus-off: its next run is a restart
 
 
 class Action(enum.Enum):

@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 from bridged.bridge.backoff import Backoff, chance
-from bridged.bridge.lifecycle import Event
+from bridged.bridge.lifecycle import Event, Verdict
 from bridged.bridge.log_limiter import LogLimiter, repeated
 
 if TYPE_CHECKING:
@@ -40,12 +40,10 @@ class BusOff:
     is closed in any case.
     """
 
-    def __init__(self, config: Config, adapter: Adapter, dispatch: Callable[[Event, str], None]) -> None:
+    def __init__(self, config: Config, adapter: Adapter, dispatch: Callable[[Verdict], None]) -> None:
         self.config = config
         self._adapter = adapter
         self._dispatch = dispatch
-        self._pause_s: float | None = None
-        self._restarting = False
         # An adapter that refuses every frame though its buffer is not full: a new start may help, but it may
         # also be that it does not know such frames.
         self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, chance)
@@ -53,38 +51,21 @@ class BusOff:
         self._discarded = 0  # of the adapter's, those told
         self._told = LogLimiter()
 
-    @property
-    def sets_pause(self) -> bool:
-        """Whether the next pause is not the back-off's."""
-        return self._pause_s is not None
-
-    def take_pause_s(self) -> float | None:
-        """How long the next pause is to be, once; None: the back-off decides."""
-        pause_s, self._pause_s = self._pause_s, None
-        return pause_s
-
-    def take_restarting(self) -> bool:
-        """Whether it runs again after bus-off; once."""
-        restarting, self._restarting = self._restarting, False
-        return restarting
-
     def off(self, cause: str, polling: HealthPolling) -> None:
         """It is bus-off, or cannot tell whether it is."""
         restart_s = self.config.channel.restart_s
         if restart_s == 0.0:  # it restarts itself
             return
         polling.taken_off()
-        self._restarting = True
         if restart_s is None:
             bus = self.config.bus
             how = "a new start of the bridge"
             if bus.interface == "socketcan":
                 how = f"ip link set {bus.channel} down, then up,"
-            self._dispatch(
-                Event.BUS_OFF, f"{cause}; channel.restart is never: {how} puts it on the bus again"
-            )
+            reason = f"{cause}; channel.restart is never: {how} puts it on the bus again"
+            self._dispatch(Verdict(Event.BUS_OFF, reason, off_bus=True))
             return
-        self._begin_anew(restart_s, f"{cause}{ANEW}")
+        self._dispatch(Verdict(Event.SILENT, f"{cause}{ANEW}", restart_s, off_bus=True))
 
     def stuck(self, frames: int, polling: HealthPolling) -> None:
         """It has taken none for stuck_s(), or none has left it; so many are in its buffer, if it tells."""
@@ -94,15 +75,19 @@ class BusOff:
         cause = f"no frame has left the adapter for {limit_s:g} s"
         if self._adapter.flow is not None:
             why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
-            self._begin_anew(pause_s, f"{cause}, {frames} are in its buffer ({why}){ANEW}")
+            reason = f"{cause}, {frames} are in its buffer ({why}){ANEW}"
+            self._dispatch(Verdict(Event.SILENT, reason, pause_s))
         elif now - polling.full_at <= limit_s:  # it cannot tell bus-off
             self.off(
                 f"{cause} (does another node acknowledge them?), its status: {polling.description}", polling
             )
         elif now >= self._refusing_until:
             self._refusing_until = now + self._refusing.next_s(now)
-            reason = f"the adapter refuses every frame, its status: {polling.description}"
-            self._begin_anew(pause_s, f"{reason} (is it in listen-only mode?); it is initialised anew")
+            reason = (
+                f"the adapter refuses every frame, its status: {polling.description} "
+                "(is it in listen-only mode?); it is initialised anew"
+            )
+            self._dispatch(Verdict(Event.SILENT, reason, pause_s))
 
     def closed(self) -> None:
         """Tells of frames that were in the adapter's buffer."""
@@ -111,7 +96,3 @@ class BusOff:
         if times is not None:
             text = "frames did not leave the adapter before its channel was closed: they are thrown away"
             log.warning("%d %s%s", frames, text, repeated(times))
-
-    def _begin_anew(self, pause_s: float, reason: str) -> None:
-        self._pause_s = pause_s
-        self._dispatch(Event.SILENT, reason)

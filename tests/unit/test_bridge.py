@@ -19,7 +19,7 @@ from books import check_books
 
 from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
-from bridged.bridge.lifecycle import Event, State
+from bridged.bridge.lifecycle import Action, Event, State, Verdict
 from bridged.config import load
 from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.service import serve
@@ -140,6 +140,27 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     b = Bench(tmp_path, monkeypatch)
     with contextlib.closing(b):
         yield b
+
+
+def test_what_an_action_leads_to_waits_until_the_actions_before_it_are_done(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge = bench.bridge()
+    steps: list[tuple[str, Action]] = []
+
+    def perform(action: Action) -> None:
+        steps.append(("begin", action))
+        if action is Action.RELEASE:
+            bridge._dispatch(Verdict(Event.TIMER))
+        steps.append(("end", action))
+
+    monkeypatch.setattr(bridge, "_perform", perform)
+    bridge.state = State.CLOSING
+    bridge._dispatch(Verdict(Event.CLOSED))
+    actions = (Action.RELEASE, Action.WAIT, Action.OPEN)
+    assert steps == [(step, action) for action in actions for step in ("begin", "end")]
+    assert bridge.state is State.OPENING
+    bridge.close()
 
 
 def test_frames_both_ways_and_closed_at_the_end(bench: Bench) -> None:
@@ -341,10 +362,10 @@ def test_the_same_failure_is_told_once(bench: Bench, caplog: pytest.LogCaptureFi
     failures = 0
     dispatch = bridge._dispatch
 
-    def counting(event: Event, reason: str = "") -> None:
+    def counting(verdict: Verdict) -> None:
         nonlocal failures
-        failures += event is Event.UNANSWERED
-        dispatch(event, reason)
+        failures += verdict.event is Event.UNANSWERED
+        dispatch(verdict)
 
     bridge._exchanges._dispatch = counting
     bridge.start()

@@ -10,7 +10,7 @@ from bridged.bridge.lifecycle import Event
 def paused() -> tuple[Exchanges, list[Event]]:
     """In a pause, and how procedures have ended."""
     ends: list[Event] = []
-    exchanges = Exchanges(None, lambda event, _reason: ends.append(event))  # type: ignore[arg-type]
+    exchanges = Exchanges(None, lambda verdict: ends.append(verdict.event))  # type: ignore[arg-type]
 
     def steps() -> Steps:
         answer = yield pause(3600.0)

@@ -15,7 +15,7 @@ from test_bridge_usb2can import Usb2canBench
 from bridged.adapters.base import Steps
 from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
-from bridged.bridge.lifecycle import Event, State
+from bridged.bridge.lifecycle import Event, State, Verdict
 from bridged.can import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_RESTARTED, CRTL_ACTIVE, BusState, error_frame
 from bridged.interfaces.python_can import PythonCanBus
 from bridged.simulators.can232 import Can232
@@ -137,7 +137,7 @@ def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["adapter-away"] == 1)
     assert (bridge.state, bridge.next_timer()) == (State.BUS_OFF, None)
     if event is Event.RESTART:
-        bridge._dispatch(event)
+        bridge._dispatch(Verdict(event))
         run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.ERROR_ACTIVE.text)
     stopped(bridge)
     assert can232.frames == []
@@ -170,7 +170,7 @@ def test_a_usb2can_is_taken_off_the_bus_if_it_is_not_to_restart_itself(
     assert frames_on_bus(usb2can).count(error_frame(CAN_ERR_BUSOFF)) == 1
     device.set_bus_off(time.monotonic(), False)
     if restart == "never":
-        bridge._dispatch(Event.RESTART)
+        bridge._dispatch(Verdict(Event.RESTART))
     run_until(bridge, lambda: bridge.state is State.RUNNING)
     assert error_frame(CAN_ERR_RESTARTED) in frames_on_bus(usb2can)
     stopped(bridge)
