@@ -22,12 +22,13 @@ from bridged.adapters import make_adapter
 from bridged.adapters.base import Reply
 from bridged.bridge.backoff import Backoff, chance
 from bridged.bridge.exchanges import REPLIES, Exchanges
+from bridged.bridge.health import Finding
 from bridged.bridge.interface import BusEnd
 from bridged.bridge.kept_port import KeptPort
 from bridged.bridge.lifecycle import Action, Event, State, Verdict, transition
 from bridged.bridge.log_limiter import LogLimiter, repeated
 from bridged.bridge.polling import NOISE, NOISE_CAUSES, HealthPolling
-from bridged.bridge.recovery import BusOff, stuck_s
+from bridged.bridge.recovery import Recovery, stuck_s
 from bridged.can import BusState
 from bridged.errors import PortError
 from bridged.interfaces import open_bus
@@ -38,6 +39,7 @@ from bridged.ports.watch import Watch
 
 if TYPE_CHECKING:
     from bridged.adapters.base import Memory
+    from bridged.bridge.exchanges import Found
     from bridged.interfaces.base import Bus
     from bridged.ports import Port
     from bridged.settings import Config
@@ -109,7 +111,7 @@ class Bridge:
         self._plugged_in = False  # since the last try
         self._starts = 0  # how often it began to run
         self._identity: object = None  # that was told
-        self._bus_off = BusOff(config, self.adapter, self._dispatch)
+        self._recovery = Recovery(config, self.adapter)
         self._unanswered_told = LogLimiter(UNANSWERED_LOG_S)
         self._counted_before: dict[str, Any] = {}  # by the bridges of this process before this one
         self._holds_bus = False  # its frames wait until the adapter runs, or fails to
@@ -129,14 +131,11 @@ class Bridge:
         )
         self._kept = KeptPort(self._relay)
         self._bus_end = BusEnd(config, self._relay, self._open_bus)
-        self._exchanges = Exchanges(self._relay, self._dispatch)
+        self._exchanges = Exchanges(self._relay)
         self._polling = HealthPolling(
             self.adapter,
             config.health.interval_s,
             ask=self._exchanges.ask,
-            tell=self._bus_end.put_error_frame,
-            failed=lambda reason: self._dispatch(Verdict(Event.SILENT, reason)),
-            bus_off=self._on_bus_off,
             stuck_s=stuck_s(config),
             tally=self._relay.tally,
         )
@@ -226,7 +225,7 @@ class Bridge:
             self._dispatch(Verdict(Event.RESTART))
         self._start_with_bus()
         self._polling.on_timer(now)
-        self._exchanges.on_timer(now)
+        self._act_on(self._exchanges.on_timer(now))
         self._sharing.on_timer(now)
 
     def has_turned(self) -> bool:
@@ -249,7 +248,7 @@ class Bridge:
         self.config = config
         self._relay.set_queue(transmit.queue, transmit.deadline_s, stuck_s(config))
         self._bus_end.adopt(config)
-        self._bus_off.config = config
+        self._recovery.adopt(config)
         self._polling.adopt(config.health.interval_s, stuck_s(config))
         self._backoff.adopt(config.reconnect.initial_s, config.reconnect.maximum_s)
         now = time.monotonic()
@@ -258,7 +257,7 @@ class Bridge:
         if channel.restart_s is not None:
             self._dispatch(Verdict(Event.RESTART))
         if self._polling.health.state is BusState.BUS_OFF:
-            self._on_bus_off("bus-off")
+            self._act_on(Finding(bus_off="bus-off"))
         return True
 
     def rates(self) -> dict[str, float]:
@@ -340,6 +339,20 @@ class Bridge:
 
     # --- lifecycle ----------------------------------------------------------------------------
 
+    def _act_on(self, found: Found) -> None:
+        """Acts on news of any part, as far as they concern the state that the bridge is in."""
+        if isinstance(found, Finding):
+            for frame in found.error_frames:
+                self._bus_end.put_error_frame(frame)
+            if found.failure:
+                self._dispatch(Verdict(Event.SILENT, found.failure))
+            elif found.bus_off and self.state is State.RUNNING:
+                self._act_on(self._recovery.off(found.bus_off))
+        elif found is not None:
+            if found.off_bus:
+                self._act_on(self._polling.taken_off())
+            self._dispatch(found)
+
     def _dispatch(self, verdict: Verdict) -> None:
         """Acts on it, and on what that leads to, one after the other.
 
@@ -409,9 +422,8 @@ class Bridge:
             case Action.INITIALISE:
                 assert self._port is not None
                 self.channel_open = True
-                self._exchanges.run(
-                    self.adapter.init_steps(self._port.serial_number, self._port.product), Event.READY
-                )
+                steps = self.adapter.init_steps(self._port.serial_number, self._port.product)
+                self._act_on(self._exchanges.run(steps, Event.READY))
             case Action.RUN:
                 self._run()
             case Action.CLOSE:
@@ -499,7 +511,7 @@ class Bridge:
         listen_only = self.config.channel.listen_only
         gate = _relay.GATE_LISTEN_ONLY if listen_only else _relay.GATE_OPEN
         self._relay.set_gates(receiving=True, transmit=gate)
-        self._polling.start(time.monotonic(), restarted=self._restarts)
+        self._act_on(self._polling.start(time.monotonic(), restarted=self._restarts))
         self._restarts = False
         self._starts += 1
         identity = self.adapter.identity
@@ -515,10 +527,10 @@ class Bridge:
         drain = stopping and (bus_state is None or bus_state < BusState.ERROR_PASSIVE)
         gate = _relay.GATE_STOPPED if stopping else _relay.GATE_AWAY
         self._relay.set_gates(receiving=not self._exchanges.running, transmit=gate)
-        self._exchanges.run(self.adapter.close_steps(drain), Event.CLOSED)
+        self._act_on(self._exchanges.run(self.adapter.close_steps(drain), Event.CLOSED))
 
     def _release(self) -> None:
-        self._bus_off.closed()
+        self._recovery.closed()
         self._polling.stop()
         self._exchanges.forget()
         self._relay.detach_port()
@@ -588,7 +600,7 @@ class Bridge:
 
     def _on_event(self, kind: int, token: int, text: bytes) -> None:
         if kind in REPLIES:
-            self._exchanges.answer(kind, token, text)
+            self._act_on(self._exchanges.answer(kind, token, text))
         elif kind == _relay.EVENT_PORT_LOST:
             failure = self._port.failure if self._port else None
             reason = f"port {self.config.adapter.port} lost: {failure or _reason(token)}"
@@ -598,7 +610,8 @@ class Bridge:
         elif kind == _relay.EVENT_UNANSWERED:
             self._on_unanswered(token)
         elif kind == _relay.EVENT_STUCK:
-            self._on_stuck(token)
+            if self.state is State.RUNNING:
+                self._act_on(self._recovery.stuck(token, self._polling))
         elif kind == _relay.EVENT_FRAME_REFUSED:
             self._polling.frame_refused()
         elif kind == _relay.EVENT_STAMPED:
@@ -611,7 +624,7 @@ class Bridge:
             self.adapter.saw_noise(text)
             self._sharing.suspect(time.monotonic())
         else:
-            self._polling.heard(text)
+            self._act_on(self._polling.heard(text))
 
     def _on_unanswered(self, resyncs: int) -> None:
         now = time.monotonic()
@@ -620,11 +633,3 @@ class Bridge:
         self._unanswered_told.well()
         if times is not None:
             log.warning("no answer from the adapter: resynchronising (resyncs=%d)", resyncs)
-
-    def _on_stuck(self, frames: int) -> None:
-        if self.state is State.RUNNING:
-            self._bus_off.stuck(frames, self._polling)
-
-    def _on_bus_off(self, cause: str) -> None:
-        if self.state is State.RUNNING:
-            self._bus_off.off(cause, self._polling)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from bridged import _relay
 from bridged.adapters.base import Answer, Reply
+from bridged.bridge.health import Finding
 from bridged.bridge.lifecycle import Event, Verdict
 from bridged.errors import AdapterError, WrongDeviceError
 
@@ -24,17 +25,20 @@ REPLIES = {
 }
 
 
-class Exchanges:
-    """Sends them by the relay; the owner hands it the relay's events with a kind in REPLIES.
+Found: TypeAlias = Finding | Verdict | None
+"""What an answer leads to; None: nothing, or another question."""
 
-    `dispatch` is told how a procedure ended: the event that it was to end with, REFUSED or UNANSWERED.
+
+class Exchanges:
+    """Sends questions by the relay; the owner hands it the relay's events with a kind in REPLIES.
+
+    A method that ends a procedure returns how: the event that run() was called with, REFUSED or UNANSWERED.
     """
 
-    def __init__(self, relay: _relay.Relay, dispatch: Callable[[Verdict], None]) -> None:
+    def __init__(self, relay: _relay.Relay) -> None:
         self._relay = relay
-        self._dispatch = dispatch
         self._tokens = itertools.count(1)
-        self._pending: dict[int, Callable[[Answer], None]] = {}
+        self._pending: dict[int, Callable[[Answer], Found]] = {}
         self._steps: Steps | None = None
         self._end = Event.CLOSED
         self.last_reply = Reply.NONE  # to a step of a procedure
@@ -45,8 +49,8 @@ class Exchanges:
         """Whether a procedure is under way."""
         return self._steps is not None
 
-    def ask(self, exchange: Exchange, then: Callable[[Answer], None], more: bool = False) -> None:
-        """`more`: another follows at once, and they go together."""
+    def ask(self, exchange: Exchange, then: Callable[[Answer], Found], more: bool = False) -> None:
+        """`then` gets the answer, in answer(). `more`: another follows at once, and they go together."""
         if exchange.opens:
             self._relay.set_gates(receiving=True, transmit=_relay.GATE_AWAY)
         token = next(self._tokens) & 0xFFFFFFFF
@@ -57,18 +61,17 @@ class Exchanges:
             accept |= _relay.ACCEPT_REFUSED
         self._relay.command(token, exchange.request, accept, exchange.prefix, exchange.timeout_s, more=more)
 
-    def run(self, steps: Steps, end: Event) -> None:
-        """Performs them one after the other; a step that was under way is forgotten, its answer awaited."""
+    def run(self, steps: Steps, end: Event) -> Verdict | None:
+        """Performs the steps one by one; a step that was under way is forgotten, its answer awaited."""
         self.forget()
         self._steps = steps
         self._end = end
-        self._advance(None)
+        return self._advance(None)
 
-    def answer(self, kind: int, token: int, text: bytes) -> None:
+    def answer(self, kind: int, token: int, text: bytes) -> Found:
         """An event of the relay; nothing happens if nobody waits for it any more."""
         then = self._pending.pop(token, None)
-        if then is not None:
-            then(Answer(REPLIES[kind], text))
+        return None if then is None else then(Answer(REPLIES[kind], text))
 
     def forget(self) -> None:
         """Nobody waits for anything any more."""
@@ -76,39 +79,38 @@ class Exchanges:
         self._pending.clear()
         self.next_at = None
 
-    def on_timer(self, now: float) -> None:
-        if self.next_at is not None and self.next_at <= now:
-            self.next_at = None
-            self._advance(Answer(Reply.NONE))
+    def on_timer(self, now: float) -> Verdict | None:
+        if self.next_at is None or self.next_at > now:
+            return None
+        self.next_at = None
+        return self._advance(Answer(Reply.NONE))
 
-    def _advance(self, answer: Answer | None) -> None:
+    def _advance(self, answer: Answer | None) -> Verdict | None:
         steps = self._steps
         assert steps is not None
         try:
             exchange = steps.send(answer) if answer else next(steps)
         except StopIteration:
             self._steps = None
-            self._dispatch(Verdict(self._end))
+            return Verdict(self._end)
         except WrongDeviceError as error:
-            self._dispatch(Verdict(Event.REFUSED, str(error)))
+            return Verdict(Event.REFUSED, str(error))
         except AdapterError as error:
-            self._dispatch(Verdict(Event.UNANSWERED, str(error)))
-        else:
-            if not exchange.request:
-                self.next_at = time.monotonic() + exchange.timeout_s
-                return
+            return Verdict(Event.UNANSWERED, str(error))
+        if exchange.request:
             self.ask(exchange, lambda reply: self._on_step_answer(exchange, reply))
+        else:
+            self.next_at = time.monotonic() + exchange.timeout_s
+        return None
 
-    def _on_step_answer(self, exchange: Exchange, answer: Answer) -> None:
+    def _on_step_answer(self, exchange: Exchange, answer: Answer) -> Verdict | None:
         self.last_reply = answer.reply
         if answer.reply in exchange.accept:
-            self._advance(answer)
-            return
+            return self._advance(answer)
         advice = f": {exchange.advice}" if exchange.advice else ""
         if answer.reply is Reply.REFUSED:
-            reason = f"the adapter refused to {exchange.purpose}{advice}"
-            self._dispatch(Verdict(Event.REFUSED, reason))
-        else:
-            wait = f"within {exchange.timeout_s:.2g} s"
-            reason = f"the adapter did not answer the request to {exchange.purpose} {wait}"
-            self._dispatch(Verdict(Event.UNANSWERED, reason))
+            return Verdict(Event.REFUSED, f"the adapter refused to {exchange.purpose}{advice}")
+        wait = f"within {exchange.timeout_s:.2g} s"
+        return Verdict(
+            Event.UNANSWERED, f"the adapter did not answer the request to {exchange.purpose} {wait}"
+        )

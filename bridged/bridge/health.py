@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from bridged.adapters.base import Happened, Observation
 from bridged.can import (
@@ -31,6 +31,14 @@ CLEAR_S = 1.0
 LARGEST_BUFFER = 64
 """Frames. More than a CAN232 (8) or any clone has room for."""
 STALL_LOOKS = 3
+
+
+class Finding(NamedTuple):
+    """News about the adapter's CAN bus, for bridge.py to act on."""
+
+    error_frames: tuple[bytes, ...] = ()  # for the interface
+    failure: str = ""  # why the adapter must be initialised again
+    bus_off: str = ""  # why it is bus-off, or is taken for it
 
 
 class Health:

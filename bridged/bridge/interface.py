@@ -143,7 +143,7 @@ class BusEnd:
         return self._dropped_before + Counter(self.bus.dropped() if self.bus else {})
 
     def put_error_frame(self, frame: bytes) -> None:
-        """What the bus of the adapter suffers, as a CAN error frame on ours; soon, if there are many."""
+        """A CAN error frame that tells of the adapter's bus; sent soon, if there are many."""
         if self._config.health.error_frames and self.bus is not None:
             self._put(self._limit.add(frame, time.monotonic()))
 

@@ -1,4 +1,4 @@
-"""Asks the adapter of one bridge how its CAN bus is, and tells the log and the bus what is new."""
+"""Asks the adapter of one bridge how its CAN bus is, logs the news and returns them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from bridged.adapters.base import UNKNOWN, Happened, Observation, Reply
-from bridged.bridge.health import Health, Stall
+from bridged.bridge.health import Finding, Health, Stall
 from bridged.bridge.log_limiter import LogLimiter, repeated
 from bridged.can import BusState
 from bridged.errors import AdapterError
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from bridged import _relay
     from bridged.adapters.base import Adapter, Answer, Exchange
+    from bridged.bridge.exchanges import Found
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +35,8 @@ NOISE_CAUSES = "a damaged cable, a wrong baud rate, or another program at its po
 class HealthPolling:
     """All questions at once, and again `interval_s` after the last answer.
 
-    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tell` puts
-    an error frame on the bus; `failed` hears why the adapter must be initialised again, `bus_off` that it is
-    bus-off, or gets rid of no frame for `stuck_s` and may be; `tally` is the relay's.
+    `ask` sends an exchange, with the next one if there is more, and calls back with its answer; `tally` is
+    the relay's. An adapter that transmits nothing for `stuck_s`, and was error-passive, may be bus-off.
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
@@ -45,10 +45,7 @@ class HealthPolling:
         adapter: Adapter,
         interval_s: float,
         *,
-        ask: Callable[[Exchange, Callable[[Answer], None], bool], None],
-        tell: Callable[[bytes], None],
-        failed: Callable[[str], None],
-        bus_off: Callable[[str], None],
+        ask: Callable[[Exchange, Callable[[Answer], Found], bool], None],
         stuck_s: float,
         tally: Callable[[], _relay.Tally],
     ) -> None:
@@ -57,9 +54,6 @@ class HealthPolling:
         self._adapter = adapter
         self._interval_s = interval_s
         self._ask = ask
-        self._tell = tell
-        self._failed = failed
-        self._bus_off = bus_off
         self._stall = Stall(stuck_s)
         self._tally = tally
         self._overruns_seen = 0
@@ -79,20 +73,21 @@ class HealthPolling:
         self._warned = LogLimiter(LOG_INTERVAL_S)
         self._told = LogLimiter()  # of bus states
 
-    def start(self, now: float, *, restarted: bool = False) -> None:
+    def start(self, now: float, *, restarted: bool = False) -> Finding:
         """The adapter runs; `restarted`: after bus-off."""
+        finding = Finding()
         if restarted:
-            self._take(Observation("restarted", happened=Happened.RESTARTED))
+            finding = self._take(Observation("restarted", happened=Happened.RESTARTED))
         counted = self._tally()
         self._overruns_seen, self._noise_seen = counted.rx_overruns, counted.skipped_bytes
         self._stall = Stall(self._stall.limit_s, counted.decoded, counted.tx_frames)
         self._unknown = 0
         self.next_at = now
+        return finding
 
-    def taken_off(self) -> None:
+    def taken_off(self) -> Finding:
         """The adapter is bus-off, or taken for it, and its channel is being closed."""
-        for frame in self.health.taken_off():
-            self._tell(frame)
+        return Finding(tuple(self.health.taken_off()))
 
     def stop(self) -> None:
         """The adapter is no more: whatever it still answers is of no interest."""
@@ -133,21 +128,21 @@ class HealthPolling:
         if self.next_at is not None:
             self._look()
 
-    def heard(self, text: bytes) -> None:
-        """What the adapter said unasked."""
+    def heard(self, text: bytes) -> Finding:
+        """Reads `text`, which the adapter said unasked."""
         log.debug("adapter said %r unasked", text)
         if self.next_at is None and self._answers is None:
             self._adapter.saw_text(text)
-            return
+            return Finding()
         try:
             seen = self._adapter.read_report(text)
         except AdapterError as error:
-            self._failed(str(error))
-            return
-        if seen is not None:
-            self._warn("adapter reports: %s", seen.description)
-            self._overtaken = self._overtaken or seen.state is not None
-            self._take(seen)
+            return Finding(failure=str(error))
+        if seen is None:
+            return Finding()
+        self._warn("adapter reports: %s", seen.description)
+        self._overtaken = self._overtaken or seen.state is not None
+        return self._take(seen)
 
     def heard_noise(self) -> bool:
         """Whether bytes without meaning came since the last look, and since this was asked last."""
@@ -169,13 +164,13 @@ class HealthPolling:
         for number, question in enumerate(questions):
             self._ask(question, functools.partial(self._answered, answers, number), number < last)
 
-    def _answered(self, answers: list[Answer | None], number: int, answer: Answer) -> None:
+    def _answered(self, answers: list[Answer | None], number: int, answer: Answer) -> Found:
         if answers is not self._answers:
-            return
+            return None
         answers[number] = answer
         self._awaited -= 1
         if number and self._awaited:
-            return
+            return None
         now = time.monotonic()
         if number == 0 and answer.reply is not Reply.NONE:
             self._answer_times_s.append(now - self._asked_at)
@@ -183,55 +178,56 @@ class HealthPolling:
             seen = self._adapter.read_health(answers)
         except AdapterError as error:
             self._answers = None
-            self._failed(str(error))
-            return
-        if seen is not None:
-            self._answers = None
-            self.next_at = now + self._interval_s
-            self._looked(seen, now)
+            return Finding(failure=str(error))
+        if seen is None:
+            return None
+        self._answers = None
+        self.next_at = now + self._interval_s
+        return self._looked(seen, now)
 
-    def _looked(self, seen: Observation, now: float) -> None:
+    def _looked(self, seen: Observation, now: float) -> Finding:
         if self._refused:
             self._refused = False
             self._warn("adapter refuses frames; its status: %s", seen.description)
         self._unknown = self._unknown + 1 if seen is UNKNOWN else 0
         if self._overtaken:
             seen = seen._replace(state=None, tec=None, rec=None)
-        self._take(seen)
+        finding = self._take(seen)
         if self._unknown == UNKNOWN_LIMIT:
-            self._failed("the adapter does not answer questions about its bus")
-            return
+            return finding._replace(failure="the adapter does not answer questions about its bus")
         counted = self._tally()
         self._sample(now, counted.rx_frames, counted.tx_frames)
         if self._stall.observe(seen, now, counted.decoded, counted.tx_frames):
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
-            self._bus_off(f"{text}: the adapter may be bus-off, or no other node acknowledges its frames")
-            return
-        if self._is_news(counted.skipped_bytes):
+            bus_off = f"{text}: the adapter may be bus-off, or no other node acknowledges its frames"
+            return finding._replace(bus_off=finding.bus_off or bus_off)
+        if not finding.bus_off and self._is_news(counted.skipped_bytes):
             self._warn(f"%s ({NOISE_CAUSES})", NOISE)
         if counted.rx_overruns != self._overruns_seen:
             self._overruns_seen = counted.rx_overruns
             text = "the adapter lost received frames"
             self._warn("%s: they were not fetched quickly enough", text)
-            self._take(Observation(text, happened=Happened.RX_OVERFLOW))
+            overrun = self._take(Observation(text, happened=Happened.RX_OVERFLOW))
+            finding = finding._replace(error_frames=finding.error_frames + overrun.error_frames)
+        return finding
 
     def _sample(self, now: float, rx_frames: int, tx_frames: int) -> None:
         self._samples.append((now, rx_frames, tx_frames))
         while len(self._samples) > 2 and now - self._samples[1][0] >= RATE_PERIOD_S:
             self._samples.popleft()
 
-    def _take(self, seen: Observation) -> None:
+    def _take(self, seen: Observation) -> Finding:
         self.description = seen.description
         if seen.happened is not Happened.NOTHING and seen.happened & Happened.TX_FULL:
             self.full_at = time.monotonic()
         before = self.health.state
-        for frame in self.health.observe(seen, time.monotonic()):
-            self._tell(frame)
+        frames = tuple(self.health.observe(seen, time.monotonic()))
         state = self.health.state
         if state is not None and state != before and (before is not None or state != BusState.ERROR_ACTIVE):
             self._log_state(state, seen.description)
             if state is BusState.BUS_OFF:
-                self._bus_off(seen.description)
+                return Finding(frames, bus_off=seen.description)
+        return Finding(frames)
 
     def _log_state(self, state: BusState, description: str) -> None:
         """A bus that is never well for long is not told each time."""

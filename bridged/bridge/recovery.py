@@ -1,4 +1,4 @@
-"""What is done when an adapter is bus-off, seems to be, or takes no frames: `channel.restart`."""
+"""Decides about an adapter that is bus-off, seems to be, or takes no frames: `channel.restart`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from bridged.bridge.lifecycle import Event, Verdict
 from bridged.bridge.log_limiter import LogLimiter, repeated
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from bridged.adapters.base import Adapter
     from bridged.bridge.polling import HealthPolling
     from bridged.settings import Config
@@ -33,17 +31,16 @@ def stuck_s(config: Config) -> float:
     return max(config.transmit.deadline_s, STUCK_LEAST_S)
 
 
-class BusOff:
-    """Decides for a running adapter; `dispatch` tells the lifecycle.
+class Recovery:
+    """Decides for a running adapter; the owner acts on the verdict. None: nothing is to be done.
 
-    What waits in the adapter's own buffer would be sent whenever the bus lets it, however old: so the channel
-    is closed in any case.
+    Frames that wait in the adapter's own buffer would be sent whenever the bus lets them, however old: so the
+    channel is closed in any case.
     """
 
-    def __init__(self, config: Config, adapter: Adapter, dispatch: Callable[[Verdict], None]) -> None:
-        self.config = config
+    def __init__(self, config: Config, adapter: Adapter) -> None:
+        self._config = config
         self._adapter = adapter
-        self._dispatch = dispatch
         # An adapter that refuses every frame though its buffer is not full: a new start may help, but it may
         # also be that it does not know such frames.
         self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, chance)
@@ -51,43 +48,49 @@ class BusOff:
         self._discarded = 0  # of the adapter's, those told
         self._told = LogLimiter()
 
-    def off(self, cause: str, polling: HealthPolling) -> None:
-        """It is bus-off, or cannot tell whether it is."""
-        restart_s = self.config.channel.restart_s
+    def adopt(self, config: Config) -> None:
+        """Other settings, but for the interface."""
+        self._config = config
+
+    def off(self, cause: str) -> Verdict | None:
+        """The adapter is bus-off, or cannot tell whether it is."""
+        restart_s = self._config.channel.restart_s
         if restart_s == 0.0:  # it restarts itself
-            return
-        polling.taken_off()
+            return None
         if restart_s is None:
-            bus = self.config.bus
+            bus = self._config.bus
             how = "a new start of the bridge"
             if bus.interface == "socketcan":
                 how = f"ip link set {bus.channel} down, then up,"
             reason = f"{cause}; channel.restart is never: {how} puts it on the bus again"
-            self._dispatch(Verdict(Event.BUS_OFF, reason, off_bus=True))
-            return
-        self._dispatch(Verdict(Event.SILENT, f"{cause}{ANEW}", restart_s, off_bus=True))
+            return Verdict(Event.BUS_OFF, reason, off_bus=True)
+        return Verdict(Event.SILENT, f"{cause}{ANEW}", restart_s, off_bus=True)
 
-    def stuck(self, frames: int, polling: HealthPolling) -> None:
-        """It has taken none for stuck_s(), or none has left it; so many are in its buffer, if it tells."""
+    def stuck(self, frames: int, polling: HealthPolling) -> Verdict | None:
+        """The adapter has taken no frame for stuck_s(), or none has left it.
+
+        `frames` are in its buffer, if it tells.
+        """
         now = time.monotonic()
-        limit_s = stuck_s(self.config)
-        pause_s = self.config.reconnect.initial_s
+        limit_s = stuck_s(self._config)
+        pause_s = self._config.reconnect.initial_s
         cause = f"no frame has left the adapter for {limit_s:g} s"
         if self._adapter.flow is not None:
             why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
             reason = f"{cause}, {frames} are in its buffer ({why}){ANEW}"
-            self._dispatch(Verdict(Event.SILENT, reason, pause_s))
-        elif now - polling.full_at <= limit_s:  # it cannot tell bus-off
-            self.off(
-                f"{cause} (does another node acknowledge them?), its status: {polling.description}", polling
+            return Verdict(Event.SILENT, reason, pause_s)
+        if now - polling.full_at <= limit_s:  # it cannot tell bus-off
+            return self.off(
+                f"{cause} (does another node acknowledge them?), its status: {polling.description}"
             )
-        elif now >= self._refusing_until:
-            self._refusing_until = now + self._refusing.next_s(now)
-            reason = (
-                f"the adapter refuses every frame, its status: {polling.description} "
-                "(is it in listen-only mode?); it is initialised anew"
-            )
-            self._dispatch(Verdict(Event.SILENT, reason, pause_s))
+        if now < self._refusing_until:
+            return None
+        self._refusing_until = now + self._refusing.next_s(now)
+        reason = (
+            f"the adapter refuses every frame, its status: {polling.description} "
+            "(is it in listen-only mode?); it is initialised anew"
+        )
+        return Verdict(Event.SILENT, reason, pause_s)
 
     def closed(self) -> None:
         """Tells of frames that were in the adapter's buffer."""

@@ -360,14 +360,14 @@ def test_the_same_failure_is_told_once(bench: Bench, caplog: pytest.LogCaptureFi
     bench.plug_in(device)
     bridge = bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.02}")
     failures = 0
-    dispatch = bridge._dispatch
+    transit = bridge._transit
 
     def counting(verdict: Verdict) -> None:
         nonlocal failures
         failures += verdict.event is Event.UNANSWERED
-        dispatch(verdict)
+        transit(verdict)
 
-    bridge._exchanges._dispatch = counting
+    bridge._transit = counting  # type: ignore[method-assign]
     bridge.start()
     run_until(bridge, lambda: failures == 3)
     stopped(bridge)

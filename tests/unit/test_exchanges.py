@@ -4,34 +4,32 @@ import math
 
 from bridged.adapters.base import Reply, Steps, pause
 from bridged.bridge.exchanges import Exchanges
-from bridged.bridge.lifecycle import Event
+from bridged.bridge.lifecycle import Event, Verdict
 
 
-def paused() -> tuple[Exchanges, list[Event]]:
-    """In a pause, and how procedures have ended."""
-    ends: list[Event] = []
-    exchanges = Exchanges(None, lambda verdict: ends.append(verdict.event))  # type: ignore[arg-type]
+def paused() -> Exchanges:
+    """In a pause."""
+    exchanges = Exchanges(None)  # type: ignore[arg-type]
 
     def steps() -> Steps:
         answer = yield pause(3600.0)
         assert answer.reply is Reply.NONE
 
-    exchanges.run(steps(), Event.CLOSED)
-    return exchanges, ends
+    assert exchanges.run(steps(), Event.CLOSED) is None
+    return exchanges
 
 
 def test_a_pause_ends_the_procedure_when_its_time_has_come() -> None:
-    exchanges, ends = paused()
+    exchanges = paused()
     assert exchanges.next_at is not None
-    exchanges.on_timer(exchanges.next_at - 1)
-    assert ends == []
-    exchanges.on_timer(exchanges.next_at)
-    assert (ends, exchanges.next_at) == ([Event.CLOSED], None)
+    assert exchanges.on_timer(exchanges.next_at - 1) is None
+    assert exchanges.on_timer(exchanges.next_at) == Verdict(Event.CLOSED)
+    assert exchanges.next_at is None
 
 
 def test_a_pause_that_is_forgotten_ends_nothing() -> None:
     """As when the port is lost in it."""
-    exchanges, ends = paused()
+    exchanges = paused()
     exchanges.forget()
-    exchanges.on_timer(math.inf)
-    assert (ends, exchanges.next_at) == ([], None)
+    assert exchanges.on_timer(math.inf) is None
+    assert exchanges.next_at is None

@@ -7,6 +7,7 @@ import pytest
 
 from bridged import _relay
 from bridged.adapters.base import UNKNOWN, Answer, Exchange, Observation, Reply
+from bridged.bridge.health import Finding
 from bridged.bridge.polling import UNKNOWN_LIMIT, HealthPolling
 from bridged.can import BusState, error_frame, state_of
 from bridged.errors import AdapterError
@@ -51,17 +52,24 @@ class Bench:
             self.adapter,  # type: ignore[arg-type]
             0.25,
             ask=lambda _exchange, then, _more: self.asked.append(then),
-            tell=self.told.append,
-            failed=self.failed.append,
-            bus_off=self.off.append,
             stuck_s=0.0,
             tally=lambda: _relay.Tally(self.counters.values()),
         )
-        self.polling.start(0.0)
+        self.note(self.polling.start(0.0))
         self.polling.on_timer(0.0)
 
+    def note(self, finding: Finding | None) -> None:
+        """What the bridge is told."""
+        if finding is not None:
+            self.told += finding.error_frames
+            self.failed += filter(None, [finding.failure])
+            self.off += filter(None, [finding.bus_off])
+
+    def hear(self) -> None:
+        self.note(self.polling.heard(b"..."))
+
     def answer(self) -> None:
-        self.asked.pop(0)(Answer(Reply.TEXT))  # type: ignore[operator]
+        self.note(self.asked.pop(0)(Answer(Reply.TEXT)))  # type: ignore[operator]
 
     def look(self) -> None:
         """A whole round."""
@@ -102,7 +110,7 @@ def test_answers_older_than_what_the_adapter_says_by_itself_are_not_believed() -
     bench = Bench()
     bench.answer()
     bench.adapter.report = Observation("passive", BusState.ERROR_PASSIVE, tec=130, rec=0)
-    bench.polling.heard(b"...")
+    bench.hear()
     bench.answer()
     assert bench.polling.health.state is BusState.ERROR_PASSIVE
     assert len(bench.told) == 1
@@ -116,7 +124,7 @@ def test_one_that_speaks_unasked_but_answers_nothing_is_initialised_again() -> N
         assert bench.failed == []
         bench.polling.on_timer(1e9)
         bench.answer()
-        bench.polling.heard(b"...")
+        bench.hear()
         bench.answer()
     assert bench.failed == ["the adapter does not answer questions about its bus"]
     assert bench.polling.health.state is BusState.ERROR_PASSIVE
@@ -163,7 +171,7 @@ def test_one_that_cannot_tell_bus_off_is_taken_for_it_when_nothing_seems_to_leav
 def test_restart_is_told_to_the_bus() -> None:
     bench = Bench()
     bench.polling.stop()
-    bench.polling.start(0.0, restarted=True)
+    bench.note(bench.polling.start(0.0, restarted=True))
     assert bench.told == [error_frame(0x100)]
     assert bench.polling.health.restarts == 1
 
@@ -174,7 +182,7 @@ def test_an_answer_after_the_end_means_nothing() -> None:
     bench.answer()
     bench.answer()
     assert (bench.asked, bench.polling.next_at, bench.polling.health.state) == ([], None, None)
-    bench.polling.heard(b"...")
+    bench.hear()
     assert (bench.told, bench.adapter.texts) == ([], [b"..."])
 
 
@@ -185,7 +193,7 @@ def test_a_flood_of_reports_with_ever_new_counters_costs_little(caplog: pytest.L
         tec, rec = 128 + n % 128, n // 128
         seen = Observation(f"error-passive, TEC {tec}, REC {rec}", state_of(tec, rec), tec=tec, rec=rec)
         bench.adapter.report = seen
-        bench.polling.heard(b"...")
+        bench.hear()
     assert time.process_time() - began_s < 0.3  # 0.05 s on a usual machine; quadratic it was 10 s
     assert len(caplog.records) < 10
 
