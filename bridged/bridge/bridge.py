@@ -31,13 +31,15 @@ from bridged.bridge.polling import NOISE, NOISE_CAUSES, HealthPolling
 from bridged.bridge.recovery import Recovery, stuck_s
 from bridged.can import BusState
 from bridged.errors import PortError
-from bridged.interfaces import open_bus
+from bridged.interfaces import open_bus as open_any_interface
 from bridged.interfaces.base import LOST_BEFORE_READ
-from bridged.ports import open_port
+from bridged.ports import open_port as open_any_port
 from bridged.ports.sharing import Sharing
 from bridged.ports.watch import Watch
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from bridged.adapters.base import Memory
     from bridged.bridge.exchanges import Found
     from bridged.interfaces.base import Bus
@@ -82,9 +84,20 @@ class Bridge:
 
     The owner calls on_readable() when a descriptor of filenos() is readable and on_timer() when
     next_timer() has come (seconds of time.monotonic()), until `finished`.
+
+    `open_port` gets the port and the baud rate, and is called in a thread of its own; `open_interface` gets
+    the settings of bridged.interfaces.open_bus(). `watch` tells when the port's device is plugged in.
     """
 
-    def __init__(self, config: Config, memory: Memory) -> None:
+    def __init__(
+        self,
+        config: Config,
+        memory: Memory,
+        *,
+        open_port: Callable[[str, int], Port] = open_any_port,
+        open_interface: Callable[..., Bus] = open_any_interface,
+        watch: Watch | None = None,
+    ) -> None:
         self.config = config
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
@@ -102,7 +115,8 @@ class Bridge:
         self._timer: float | None = None
         reconnect = config.reconnect
         self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, chance)
-        self._watch = Watch(config.adapter.port, config.adapter.usb_serial_number)
+        self._open_port = open_port
+        self._watch = watch or Watch(config.adapter.port, config.adapter.usb_serial_number)
         self._sharing = Sharing()
         self._path = config.adapter.port  # where it was last
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
@@ -130,7 +144,7 @@ class Bridge:
             sync_prefix=sync.prefix,
         )
         self._kept = KeptPort(self._relay)
-        self._bus_end = BusEnd(config, self._relay, self._open_bus)
+        self._bus_end = BusEnd(config, self._relay, open_interface)
         self._exchanges = Exchanges(self._relay)
         self._polling = HealthPolling(
             self.adapter,
@@ -329,10 +343,6 @@ class Bridge:
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
 
-    def _open_bus(self) -> Bus:
-        bus = self.config.bus
-        return open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options)
-
     def _start_with_bus(self) -> None:
         if self.state is State.IDLE and self._bus_end.bus is not None:
             self._dispatch(Verdict(Event.START))
@@ -415,7 +425,7 @@ class Bridge:
                 self._opening = True
                 port = self._kept.take()
                 if port is None:
-                    threading.Thread(target=self._open_port, name="open", daemon=True).start()
+                    threading.Thread(target=self._open, name="open", daemon=True).start()
                 else:
                     self._opened.put(port)
                     os.eventfd_write(self._opened_fd, 1)
@@ -455,7 +465,7 @@ class Bridge:
         if self._watch.is_there():
             self._dispatch(Verdict(Event.APPEARED))
 
-    def _open_port(self) -> None:
+    def _open(self) -> None:
         result: Port | Exception
         try:
             self._watch.refuse_stranger()
@@ -463,7 +473,7 @@ class Bridge:
             if path not in {self._path, self.config.adapter.port}:
                 log.info("%s has the serial number that is wanted, not %s", path, self.config.adapter.port)
             self._path = path
-            result = open_port(path, self.adapter.baudrate)
+            result = self._open_port(path, self.adapter.baudrate)
         except Exception as error:  # noqa: BLE001 - a bug is raised again in the thread that can end the bridge
             result = error
         self._opened.put(result)

@@ -34,7 +34,7 @@ class BusEnd:
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
-    def __init__(self, config: Config, relay: _relay.Relay, open_bus: Callable[[], Bus]) -> None:
+    def __init__(self, config: Config, relay: _relay.Relay, open_interface: Callable[..., Bus]) -> None:
         self.bus: Bus | None = None
         self.reason = ""  # why it is not open, or carries nothing
         self.retry_at: float | None = None  # the interface is looked for again then
@@ -42,14 +42,17 @@ class BusEnd:
         self._error_frames = Counter(error_frames=0, error_frames_lost=0)
         self._config = config
         self._relay = relay
-        self._open_bus = open_bus
+        self._open_interface = open_interface
         self._told = LogLimiter()
         self._dropped_before: Counter[str] = Counter()  # on buses that were closed since
 
     def open(self) -> None:
         """Opens it, or tries again later."""
+        wanted = self._config.bus
         try:
-            bus = self._open_bus()
+            bus = self._open_interface(
+                wanted.interface, wanted.channel, create=wanted.create, options=wanted.options
+            )
         except BusError as error:
             self._not_open(str(error))
             return

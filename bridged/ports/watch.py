@@ -40,15 +40,20 @@ class Watch:
     without AF_NETLINK): then only is_there() tells.
     """
 
-    def __init__(self, port: str, usb_serial_number: str | None = None) -> None:
-        """With `usb_serial_number`, a tty may have another path than `port`: it is known by that number."""
+    def __init__(
+        self, port: str, usb_serial_number: str | None = None, events: socket.socket | None = None
+    ) -> None:
+        """With `usb_serial_number`, a tty may have another path than `port`: it is known by that number.
+
+        `events` is non-blocking and stands for the kernel's socket of device events.
+        """
         self._port = port
         self._usb_serial_number = usb_serial_number
         self._usb = _USB_URL.fullmatch(port)
         self._is_numbered = is_numbered_terminal(port)
         self._terminal: tuple[int, int] | None = None  # the numbered one that was opened
-        self._socket: socket.socket | None = None
-        if self._usb or "://" not in port:
+        self._socket = events
+        if events is None and (self._usb or "://" not in port):
             with contextlib.suppress(OSError):
                 self._socket = socket.socket(
                     socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, _NETLINK_KOBJECT_UEVENT

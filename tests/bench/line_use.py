@@ -18,7 +18,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
 from bridged.config import load
 from bridged.daemon.eeprom_store import FileMemory
@@ -92,8 +91,9 @@ def measure(window: int, seconds: float) -> tuple[float, int]:
             f"adapter: {{type: can232, port: {link}, baudrate: {BAUD}}}\nchannel: {{bitrate: 1000000}}\n"
             f"bus: {{channel: vcan0}}\ntransmit: {{window: {window}}}\n"
         )
-        bridge_module.open_bus = lambda *_args, **_options: FloodedBus()  # type: ignore[assignment]
-        bridge = Bridge(load(path), FileMemory(folder))
+        bridge = Bridge(
+            load(path), FileMemory(folder), open_interface=lambda *_args, **_options: FloodedBus()
+        )
         bridge.start()
         while simulator.is_alive():
             if select.select(bridge.filenos(), (), (), 0.2)[0]:

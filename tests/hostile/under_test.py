@@ -21,7 +21,6 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
 from bridged.config import load
@@ -137,10 +136,11 @@ def main() -> int:
     lines = CountLines()
     logging.getLogger().addHandler(lines)
     bus = Bus(int(sys.argv[2]))
-    bridge_module.open_bus = lambda *_arguments, **_options: bus  # type: ignore[assignment]
     path = Path(sys.argv[1])
     before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    bridge = Bridge(load(path), FileMemory(path.parent / "state"))
+    bridge = Bridge(
+        load(path), FileMemory(path.parent / "state"), open_interface=lambda *_arguments, **_options: bus
+    )
     books = Books()
     bridge.start()
     look_at = longest = 0.0

@@ -17,12 +17,13 @@ from typing import Any
 import pytest
 from books import check_books
 
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Action, Event, State, Verdict
 from bridged.config import load
 from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.service import serve
+from bridged.ports import open_port
+from bridged.ports.watch import Watch
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232 import State as Channel
 from bridged.simulators.serve import Fault, Simulator
@@ -55,12 +56,14 @@ class PairBus:
 class Bench:
     """A simulated adapter, a bridge on it, and the far end of its bus. The bridge runs in run_until()."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.link = folder / "can232"
         self.frames: list[Frame] = []  # that the adapter put on its CAN bus
         self.bus = PairBus()
-        monkeypatch.setattr(bridge_module, "open_bus", lambda *_args, **_options: self.bus)
+        self.open_port: Callable[[str, int], Any] = open_port
+        self.open_interface: Callable[..., Any] = lambda *_args, **_options: self.bus
+        self.watch: Watch | None = None
         self._simulator: Simulator | None = None
         self._thread: threading.Thread | None = None
 
@@ -91,7 +94,27 @@ class Bench:
                 "transmit: {}\n", ""
             )
         )
-        return Bridge(load(path), FileMemory(self.folder / "state"))
+        return self.bridge_of(path)
+
+    def bridge_of(self, path: Path) -> Bridge:
+        return Bridge(
+            load(path),
+            FileMemory(self.folder / "state"),
+            open_port=self._open_port,
+            open_interface=self.open_interface,
+            watch=self.watch,
+        )
+
+    def _open_port(self, port: str, baudrate: int) -> Any:
+        """As `open_port` says at that time."""
+        return self.open_port(port, baudrate)
+
+    def watch_events(self) -> tuple[socket.socket, socket.socket]:
+        """Where the kernel would tell the next bridge of devices, and where that listens."""
+        kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        ours.setblocking(False)
+        self.watch = Watch(str(self.link), events=ours)
+        return kernel, ours
 
     def close(self) -> None:
         self.pull_out()
@@ -136,8 +159,8 @@ def type_in(device: Can232, *commands: bytes) -> None:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    b = Bench(tmp_path, monkeypatch)
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    b = Bench(tmp_path)
     with contextlib.closing(b):
         yield b
 
@@ -312,12 +335,8 @@ def test_pulled_out_and_plugged_in_again(bench: Bench) -> None:
 
 def test_plugged_in_late_and_told_at_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     """The event is the kernel's for a tty; the pause alone would last a minute."""
+    kernel, ours = bench.watch_events()
     bridge = bench.bridge(more="reconnect: {initial: 60, maximum: 60}")
-    looking = bridge._watch
-    looking.close()
-    kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    ours.setblocking(False)
-    looking._socket, looking.fd = ours, ours.fileno()
     with kernel, caplog.at_level(logging.INFO):
         started(bridge, State.WAITING)
         assert bridge.snapshot()["reason"].startswith(f"{bench.link}: does not exist; serial adapters here:")
@@ -460,10 +479,10 @@ def lines(port: PairPort) -> Iterator[bytes]:
                 yield line
 
 
-def test_each_piece_of_the_flush_is_a_write_of_its_own(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_piece_of_the_flush_is_a_write_of_its_own(bench: Bench) -> None:
     """So it becomes a USB packet of its own; also with a window that lets several commands go at once."""
     port = PairPort(socket.SOCK_SEQPACKET)
-    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bench.open_port = lambda *_args: port
     bridge = bench.bridge(transmit="{window: 8}")
     bridge.start()
     writes: list[bytes] = []
@@ -476,11 +495,9 @@ def test_each_piece_of_the_flush_is_a_write_of_its_own(bench: Bench, monkeypatch
 
 
 @pytest.mark.parametrize(("last", "state"), [(b"S4\r", State.FAULT), (b"O\r", State.BACKOFF)])
-def test_the_plug_is_pulled_in_the_moment_that_ends_a_state(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, last: bytes, state: State
-) -> None:
+def test_the_plug_is_pulled_in_the_moment_that_ends_a_state(bench: Bench, last: bytes, state: State) -> None:
     port = PairPort()
-    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bench.open_port = lambda *_args: port
 
     def device() -> None:
         closing = 0
@@ -513,13 +530,11 @@ def test_the_plug_is_pulled_in_the_moment_that_ends_a_state(
     stopped(bridge)
 
 
-def test_a_port_that_the_relay_cannot_take_is_closed_and_tried_again(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_port_that_the_relay_cannot_take_is_closed_and_tried_again(bench: Bench) -> None:
     """As where no descriptor is left; here it is a file, for which epoll does not wait."""
     file = (bench.folder / "file").open("w")
     port = SimpleNamespace(fd=file.fileno(), failure=None, serial_number=None, close=file.close)
-    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bench.open_port = lambda *_args: port
     bridge = bench.bridge()
     bridge.start()
     run_until(bridge, lambda: bridge.state in {State.BACKOFF, State.WAITING})
@@ -528,13 +543,11 @@ def test_a_port_that_the_relay_cannot_take_is_closed_and_tried_again(
     stopped(bridge)
 
 
-def test_a_bug_at_the_start_does_not_leave_the_process_behind(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bug_at_the_start_does_not_leave_the_process_behind(bench: Bench) -> None:
     def bug(*_args: object, **_options: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(bridge_module, "open_bus", bug)
+    bench.open_interface = bug
     bridge = bench.bridge()
     with pytest.raises(ZeroDivisionError):
         serve(bridge, None)

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import pty
-import socket
 import termios
 import time
 from collections.abc import Iterator
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 from test_bridge import Bench, run_until, started, stopped
 
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge.lifecycle import State
 from bridged.errors import PortError
 from bridged.ports import Port, open_port
@@ -20,20 +18,16 @@ from bridged.simulators.can232 import Can232
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path, monkeypatch)) as b:
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path)) as b:
         yield b
 
 
 @pytest.mark.parametrize("failures", [1, 2])
-def test_one_more_try_at_once(bench: Bench, monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
+def test_one_more_try_at_once(bench: Bench, failures: int) -> None:
     """The news comes once, and the pause would last a minute; but what fails again waits for it."""
+    kernel, _ = bench.watch_events()
     bridge = bench.bridge(more="reconnect: {initial: 60, maximum: 60}")
-    watch = bridge._watch
-    watch.close()
-    kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    ours.setblocking(False)
-    watch._socket, watch.fd = ours, ours.fileno()
     tries = []
 
     def open_late(path: str, baudrate: int) -> Port:
@@ -44,7 +38,7 @@ def test_one_more_try_at_once(bench: Bench, monkeypatch: pytest.MonkeyPatch, fai
 
     with kernel:
         started(bridge, State.WAITING)
-        monkeypatch.setattr(bridge_module, "open_port", open_late)
+        bench.open_port = open_late
         bench.plug_in(Can232(time.monotonic()))
         name = bench.link.resolve().name
         kernel.send(f"add@/x\0ACTION=add\0SUBSYSTEM=tty\0DEVNAME={name}\0".encode())

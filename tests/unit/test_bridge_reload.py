@@ -21,8 +21,8 @@ INTERVAL_S = 0.01
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path, monkeypatch)) as made:
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path)) as made:
         receive_stamped(made.bus._near)
         made.plug_in(Can232(time.monotonic()))
         yield made
@@ -58,8 +58,8 @@ def after(seconds: float) -> Callable[[], bool]:
 
 
 @pytest.fixture
-def usb2can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Usb2canBench]:
-    with contextlib.closing(Usb2canBench(tmp_path, monkeypatch)) as made:
+def usb2can(tmp_path: Path) -> Iterator[Usb2canBench]:
+    with contextlib.closing(Usb2canBench(tmp_path)) as made:
         made.device_plugged_in()
         yield made
 

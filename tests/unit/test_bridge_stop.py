@@ -12,8 +12,8 @@ from bridged.simulators.can232 import TRANSMIT_FIFO, Can232
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path, monkeypatch)) as b:
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path)) as b:
         yield b
 
 

@@ -15,11 +15,8 @@ from typing import Any
 import pytest
 from test_bridge import LIMIT_S, Bench, PairBus, PairPort, run_until, started, stopped
 
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
-from bridged.config import load
-from bridged.daemon.eeprom_store import FileMemory
 from bridged.simulators.ends import pack, unpack
 from bridged.simulators.serve import Simulator, mixed_frames
 from bridged.simulators.sja1000 import Frame
@@ -33,8 +30,8 @@ SLOW = "bitrate: 10000"  # a frame takes 5 ms and more
 class Usb2canBench(Bench):
     """A simulated USB2CAN; `on_frame` is called in its thread for each frame that it puts on its bus."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        super().__init__(folder, monkeypatch)
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
         self.link = folder / "usb2can"
         self.on_frame: Callable[[Usb2can], None] = lambda _device: None
         self._buses = [self.bus]
@@ -69,7 +66,7 @@ class Usb2canBench(Bench):
         text = f"adapter: {{type: usb2can, port: {self.link}{options}}}\nchannel: {{{channel}}}\n"
         text += "bus: {channel: vcan0}\n" + (f"transmit: {transmit}\n" if transmit else "")
         path.write_text(text)
-        bridge = Bridge(load(path), FileMemory(self.folder / "state"))
+        bridge = self.bridge_of(path)
         self._bridges.append(bridge)
         return bridge
 
@@ -94,8 +91,8 @@ class Usb2canBench(Bench):
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Usb2canBench]:
-    b = Usb2canBench(tmp_path, monkeypatch)
+def bench(tmp_path: Path) -> Iterator[Usb2canBench]:
+    b = Usb2canBench(tmp_path)
     with contextlib.closing(b):
         yield b
 
@@ -375,9 +372,9 @@ def test_a_serial_number_that_cannot_be_kept_to_is_a_fault(bench: Usb2canBench) 
     assert_closed(bench, device)
 
 
-def test_a_triple_is_a_fault(bench: Usb2canBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_triple_is_a_fault(bench: Usb2canBench) -> None:
     port = PairPort()
-    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bench.open_port = lambda *_args: port
 
     def triple() -> None:
         while port.far.recv(4096):
@@ -398,7 +395,7 @@ def test_a_triple_is_a_fault(bench: Usb2canBench, monkeypatch: pytest.MonkeyPatc
 class StallingDevice:
     """A simulated USB2CAN at the far end of a socketpair; it reads `reads` bytes more (None: all)."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, bench: Usb2canBench) -> None:
         self.port = PairPort()
         self.openings = 0
         self.reads: int | None = None
@@ -406,7 +403,7 @@ class StallingDevice:
         self.frames: list[Frame] = []
         self._thread = threading.Thread(target=self._live)
         self._thread.start()
-        monkeypatch.setattr(bridge_module, "open_port", self._open)
+        bench.open_port = self._open
 
     def _open(self, *_args: object) -> PairPort:
         self.openings += 1
@@ -434,9 +431,9 @@ class StallingDevice:
 
 
 @pytest.fixture
-def stalling(bench: Usb2canBench, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Bridge, StallingDevice]]:
+def stalling(bench: Usb2canBench) -> Iterator[tuple[Bridge, StallingDevice]]:
     """In the middle of one of three frames, when it is noticed."""
-    end = StallingDevice(monkeypatch)
+    end = StallingDevice(bench)
     bridge = started(bench.bridge())
     end.reads = 20
     bench.send(*numbered(3, length=8))

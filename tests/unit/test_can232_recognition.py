@@ -24,7 +24,6 @@ from clone_parsers import (
 )
 from test_bridge import Bench, PairPort, bench, run_until, started, stopped  # noqa: F401 - a fixture
 
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge.lifecycle import State
 from bridged.errors import AdapterError, WrongDeviceError
 from bridged.simulators.can232 import Can232
@@ -227,10 +226,9 @@ def test_noise_that_looks_like_text_now_and_then_is_no_answer() -> None:
 
 def test_a_long_answer_with_tabs_reaches_the_log(
     bench: Bench,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     port = PairPort()
-    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bench.open_port = lambda *_args: port
     device = Elmue()
 
     def answer() -> None:
@@ -254,11 +252,10 @@ def test_a_long_answer_with_tabs_reaches_the_log(
 
 def test_a_cantact_is_refused_by_the_bridge_without_a_byte(
     bench: Bench,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     port = PairPort()
     port.product = "CANtact dev"
-    monkeypatch.setattr(bridge_module, "open_port", lambda *_args: port)
+    bench.open_port = lambda *_args: port
     bridge = started(bench.bridge(), State.FAULT)
     reason = bridge.reason
     stopped(bridge)

@@ -71,7 +71,7 @@ class Bench:
         monkeypatch.setattr(bus_end, "time", SimpleNamespace(monotonic=lambda: self.now))
         monkeypatch.setattr(socketcan, "is_up", lambda _channel: self.up)
 
-    def open(self) -> LosingBus:
+    def open(self, *_args: object, **_options: object) -> LosingBus:
         if self.error:
             raise self.error
         self.buses.append(LosingBus(self.warning))

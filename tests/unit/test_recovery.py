@@ -27,14 +27,14 @@ TRANSMIT = f"{{deadline: {DEADLINE_S}}}"
 
 
 @pytest.fixture
-def can232(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path, monkeypatch)) as bench:
+def can232(tmp_path: Path) -> Iterator[Bench]:
+    with contextlib.closing(Bench(tmp_path)) as bench:
         yield bench
 
 
 @pytest.fixture
-def usb2can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Usb2canBench]:
-    with contextlib.closing(Usb2canBench(tmp_path, monkeypatch)) as bench:
+def usb2can(tmp_path: Path) -> Iterator[Usb2canBench]:
+    with contextlib.closing(Usb2canBench(tmp_path)) as bench:
         yield bench
 
 
@@ -70,12 +70,10 @@ def heals(bench: Bench, bridge: Bridge, device: Can232, born: list[float]) -> No
     assert status["counters"]["bus_off_restarts"] == status["counters"]["reconnects"] >= 1
 
 
-def test_an_interface_without_error_frames_makes_no_counter_negative(
-    can232: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interface_without_error_frames_makes_no_counter_negative(can232: Bench) -> None:
     """The bridge's own error frames are no frames of the adapter's, wherever they end."""
     bus = PythonCanBus("pcan", "x", can.Bus(interface="virtual", channel=str(can232.folder)))
-    monkeypatch.setattr(bridge_module, "open_bus", lambda *_args, **_options: bus)
+    can232.open_interface = lambda *_args, **_options: bus
     device = Can232(time.monotonic())
     can232.plug_in(device)
     bridge = started(can232.bridge())

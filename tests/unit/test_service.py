@@ -19,7 +19,6 @@ from typing import Any
 import pytest
 
 from bridged import VERSION
-from bridged.bridge import bridge as bridge_module
 from bridged.bridge import interface as bus_end
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
@@ -29,6 +28,7 @@ from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.notify import Notifier
 from bridged.daemon.service import Service
 from bridged.errors import BusError, ConfigError
+from bridged.interfaces.base import Bus
 from bridged.interfaces.python_can import open_python_can
 
 DEADLINE_S = 20.0
@@ -405,13 +405,12 @@ class TestReady:
         monkeypatch.setattr(bus_end, "RETRY_S", 0.05)
         opened: list[object] = []
 
-        def open_bus(*arguments: Any, **_options: Any) -> object:
+        def open_interface(*arguments: Any, **_options: Any) -> Bus:
             opened.append(arguments)
             if len(opened) < 3:
                 raise BusError("vcan0: there is no such interface")
             return open_python_can("virtual", tmp_path.name, {})
 
-        monkeypatch.setattr(bridge_module, "open_bus", open_bus)
         heard: list[str] = []
 
         def notified(text: str) -> None:
@@ -420,7 +419,8 @@ class TestReady:
                 os.kill(os.getpid(), signal.SIGTERM)
 
         config = load(write_config(tmp_path / "one.yaml"))
-        Service(Bridge(config, FileMemory(tmp_path)), Notifier(notified)).run()
+        bridge = Bridge(config, FileMemory(tmp_path), open_interface=open_interface)
+        Service(bridge, Notifier(notified)).run()
         assert heard[:2] == ["STATUS=bus not open: vcan0: there is no such interface", "READY=1"]
         assert heard.count("READY=1") == 1
         assert len(opened) == 3
