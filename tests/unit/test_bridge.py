@@ -1,6 +1,7 @@
 """Bridge, relay and adapter against a simulated CAN232 on a real pty; only the CAN side is a socketpair."""
 
 import contextlib
+import errno
 import logging
 import os
 import re
@@ -17,6 +18,7 @@ from typing import Any
 import pytest
 from books import check_books
 
+from bridged import _relay
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Action, Event, State, Verdict
 from bridged.config import load
@@ -183,6 +185,22 @@ def test_what_an_action_leads_to_waits_until_the_actions_before_it_are_done(
     actions = (Action.RELEASE, Action.WAIT, Action.OPEN)
     assert steps == [(step, action) for action in actions for step in ("begin", "end")]
     assert bridge.state is State.OPENING
+    bridge.close()
+
+
+def test_an_interface_that_was_lost_with_the_port_is_opened_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its event comes with those of the port that is given back, which mean nothing any more."""
+    bridge = bench.bridge()
+    bridge._bus_end.open()
+    relay = SimpleNamespace(
+        detach_port=lambda: None, events=lambda: [(_relay.EVENT_INTERFACE_LOST, errno.ENODEV, b"")]
+    )
+    monkeypatch.setattr(bridge, "_relay", relay)
+    bridge._release()
+    assert bridge._bus_end.bus is None
+    assert bridge._bus_end.reason.startswith("bus lost: pair")
     bridge.close()
 
 

@@ -6,6 +6,8 @@ import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import can
 import pytest
@@ -16,6 +18,7 @@ from bridged.adapters.base import Steps
 from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Event, State, Verdict
+from bridged.bridge.recovery import Recovery
 from bridged.can import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_RESTARTED, CRTL_ACTIVE, BusState, error_frame
 from bridged.interfaces.python_can import PythonCanBus
 from bridged.simulators.can232 import Can232
@@ -259,3 +262,15 @@ def test_a_stop_does_not_wait_for_an_error_passive_adapter(
     run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-passive")
     stopped(bridge)
     assert closings.drains == [False]
+
+
+def test_frames_that_were_thrown_away_are_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    adapter: Any = SimpleNamespace(discarded=0)
+    recovery = Recovery(cast("Any", None), adapter)
+    recovery.closed()
+    assert caplog.messages == []
+    adapter.discarded = 3
+    recovery.closed()
+    recovery.closed()
+    (line,) = caplog.messages
+    assert line.startswith("3 frames did not leave the adapter before its channel was closed")

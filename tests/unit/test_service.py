@@ -240,6 +240,13 @@ class TestSignals:
 
         return Service(bridge, None, successor), done
 
+    def test_a_stop_closes_the_bridge_that_waits_to_take_over(self, made: tuple[Service, list[str]]) -> None:
+        running, done = made
+        waiting: Any = SimpleNamespace(close=lambda: done.append("closed"))
+        running._successor = waiting
+        running._stop("SIGTERM")
+        assert (done, running._successor) == (["closed", "stop"], None)
+
     def test_many_are_one_reload(self, made: tuple[Service, list[str]]) -> None:
         running, done = made
         with service._signals() as (reader, came):
