@@ -23,7 +23,7 @@ from bridged.adapters.base import Reply
 from bridged.bridge.backoff import Backoff, chance
 from bridged.bridge.exchanges import REPLIES, Exchanges
 from bridged.bridge.health import Finding
-from bridged.bridge.interface import BusEnd
+from bridged.bridge.interface import Interface
 from bridged.bridge.kept_port import KeptPort
 from bridged.bridge.lifecycle import Action, Event, State, Verdict, transition
 from bridged.bridge.log_limiter import LogLimiter, repeated
@@ -58,11 +58,11 @@ HAND_OVER_LOOK_S = 0.005
 # States before the adapter runs for the first time.
 COMING_UP = (State.IDLE, State.OPENING, State.INITIALISING)
 # States that end at once when the device is plugged in.
-LOOKING_OUT = (State.WAITING, State.BACKOFF, State.FAULT)
-# What the adapter did, or did not, led to them.
+AWAITING_DEVICE = (State.WAITING, State.BACKOFF, State.FAULT)
+# States entered because the adapter failed.
 FAILING = (State.CLOSING, State.REJECTING)
-# Their reason is that of the failure before.
-AFTERMATH = (*LOOKING_OUT, State.BUS_OFF)
+# States that keep showing the reason of the failure before.
+KEEPING_REASON = (*AWAITING_DEVICE, State.BUS_OFF)
 
 
 def _reason(error: int) -> str:
@@ -144,7 +144,7 @@ class Bridge:
             sync_prefix=sync.prefix,
         )
         self._kept = KeptPort(self._relay)
-        self._bus_end = BusEnd(config, self._relay, open_interface)
+        self._interface = Interface(config, self._relay, open_interface)
         self._exchanges = Exchanges(self._relay)
         self._polling = HealthPolling(
             self.adapter,
@@ -172,12 +172,12 @@ class Bridge:
             self._counted_before = predecessor.snapshot()["counters"]
             self._started = predecessor._started
         if bus is None:
-            self._bus_end.open()
+            self._interface.open()
         else:
             self._holds_bus = True
             self._relay.hold_interface(True)
             assert predecessor is not None
-            self._bus_end.use(bus, predecessor._bus_end.reason)
+            self._interface.use(bus, predecessor._interface.reason)
         self._start_with_bus()
 
     def stop(self, successor: Config | None = None) -> None:
@@ -186,7 +186,7 @@ class Bridge:
         `successor`: the configuration of the bridge that goes on. If it has the same bus, frames wait in that
         from now on, and those that were read before are sent first, for HAND_OVER_S at most.
         """
-        self._bus_end.retry_at = None
+        self._interface.retry_at = None
         hands_over = successor is not None and successor.bus == self.config.bus
         self._holds_bus = False
         self._relay.hold_interface(hands_over)
@@ -219,13 +219,13 @@ class Bridge:
             self._on_opened()
         for kind, token, text in self._relay.events():
             self._on_event(kind, token, text)
-        if self.state in LOOKING_OUT and self._watch.has_come():
+        if self.state in AWAITING_DEVICE and self._watch.has_come():
             log.info("%s was plugged in", self.config.adapter.port)
             self._plugged_in = True
             self._dispatch(Verdict(Event.APPEARED))
 
     def next_timer(self) -> float | None:
-        parts = (self._bus_end, self._polling, self._exchanges, self._sharing)
+        parts = (self._interface, self._polling, self._exchanges, self._sharing)
         timers = (self._timer, self._look_again_at, *(part.next_at for part in parts))
         return min((t for t in timers if t is not None), default=None)
 
@@ -235,7 +235,7 @@ class Bridge:
             self._dispatch(Verdict(Event.TIMER))
         if self._look_again_at is not None and self._look_again_at <= now:
             self._stop_when_sent()
-        if self._bus_end.on_timer(now):
+        if self._interface.on_timer(now):
             self._dispatch(Verdict(Event.RESTART))
         self._start_with_bus()
         self._polling.on_timer(now)
@@ -261,12 +261,12 @@ class Bridge:
             return False
         self.config = config
         self._relay.set_queue(transmit.queue, transmit.deadline_s, stuck_s(config))
-        self._bus_end.adopt(config)
+        self._interface.adopt(config)
         self._recovery.adopt(config)
         self._polling.adopt(config.health.interval_s, stuck_s(config))
         self._backoff.adopt(config.reconnect.initial_s, config.reconnect.maximum_s)
         now = time.monotonic()
-        if self.state in LOOKING_OUT and self._timer is not None:
+        if self.state in AWAITING_DEVICE and self._timer is not None:
             self._timer = min(self._timer, now + self._backoff.next_s(now))
         if channel.restart_s is not None:
             self._dispatch(Verdict(Event.RESTART))
@@ -289,12 +289,12 @@ class Bridge:
 
     def condition(self) -> tuple[State, str, bool]:
         """The state, the reason why it is not running, whether the bus is open."""
-        reason = "; ".join(filter(None, (self.reason, self._bus_end.reason, self.circle)))
-        return self.state, reason, self._bus_end.bus is not None
+        reason = "; ".join(filter(None, (self.reason, self._interface.reason, self.circle)))
+        return self.state, reason, self._interface.bus is not None
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""
-        lost = self._bus_end.lost_frames()  # before the relay's, so that each of them is in those
+        lost = self._interface.lost_frames()  # before the relay's, so that each of them is in those
         counters: dict[str, Any] = self._relay.counters()
         for reason, n in lost.items():
             if reason in LOST_BEFORE_READ:
@@ -313,7 +313,7 @@ class Bridge:
             "reconnects": max(0, self._starts - 1),
             "bus_off_restarts": health.restarts,
             **health.happened,
-            **self._bus_end.error_frames(),
+            **self._interface.error_frames(),
             "tx_discarded": self.adapter.discarded,
             **counters,
         }
@@ -336,7 +336,7 @@ class Bridge:
             "bus": {
                 "interface": self.config.bus.interface,
                 "channel": self.config.bus.channel,
-                "open": self._bus_end.bus is not None,
+                "open": self._interface.bus is not None,
             },
             "counters": _sum(self._counted_before, counted),
             "queued": queued,
@@ -344,7 +344,7 @@ class Bridge:
         }
 
     def _start_with_bus(self) -> None:
-        if self.state is State.IDLE and self._bus_end.bus is not None:
+        if self.state is State.IDLE and self._interface.bus is not None:
             self._dispatch(Verdict(Event.START))
 
     # --- lifecycle ----------------------------------------------------------------------------
@@ -353,7 +353,7 @@ class Bridge:
         """Acts on news of any part, as far as they concern the state that the bridge is in."""
         if isinstance(found, Finding):
             for frame in found.error_frames:
-                self._bus_end.put_error_frame(frame)
+                self._interface.put_error_frame(frame)
             if found.failure:
                 self._dispatch(Verdict(Event.SILENT, found.failure))
             elif found.bus_off and self.state is State.RUNNING:
@@ -399,7 +399,7 @@ class Bridge:
             reason += f"; there is {NOISE} ({NOISE_CAUSES})"
         if self.state is State.BUS_OFF:
             reason = f"the bridge has taken the adapter off its CAN bus: {self.reason}"
-        self.reason = reason or (self.reason if self.state in AFTERMATH else "")
+        self.reason = reason or (self.reason if self.state in KEEPING_REASON else "")
         now = time.monotonic()
         times = self._told.tell(reason, now) if reason else None
         if times is not None:
@@ -589,7 +589,7 @@ class Bridge:
             return None
         if any(kind == _relay.EVENT_INTERFACE_LOST for kind, _, _ in self._relay.events()):
             return None
-        return self._bus_end.hand_over()
+        return self._interface.hand_over()
 
     def _take_over_port(self, old: Bridge) -> None:
         """What a bridge that ended has kept of the port, if this one has the same adapter."""
@@ -600,7 +600,7 @@ class Bridge:
     def close(self) -> None:
         """After `finished`, or instead of start(): gives back what it holds."""
         self._kept.close()
-        self._bus_end.close()
+        self._interface.close()
         self._watch.close()
         if not self._opening and self._opened_fd >= 0:
             os.close(self._opened_fd)
@@ -627,9 +627,9 @@ class Bridge:
         elif kind == _relay.EVENT_STAMPED:
             self.adapter.saw_time_stamps()
         elif kind == _relay.EVENT_INTERFACE_DOWN:
-            self._bus_end.on_down()
+            self._interface.on_down()
         elif kind == _relay.EVENT_INTERFACE_LOST:
-            self._bus_end.on_lost(token)
+            self._interface.on_lost(token)
         elif kind == _relay.EVENT_NOISE:
             self.adapter.saw_noise(text)
             self._sharing.suspect(time.monotonic())

@@ -28,7 +28,7 @@ RETRY_S = 1.0
 ERROR_FRAME_INTERVAL_S = 0.01
 
 
-class BusEnd:
+class Interface:
     """Keeps a bus open and attached to the relay, whatever becomes of the interface.
 
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.

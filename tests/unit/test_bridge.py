@@ -193,14 +193,14 @@ def test_an_interface_that_was_lost_with_the_port_is_opened_again(
 ) -> None:
     """Its event comes with those of the port that is given back, which mean nothing any more."""
     bridge = bench.bridge()
-    bridge._bus_end.open()
+    bridge._interface.open()
     relay = SimpleNamespace(
         detach_port=lambda: None, events=lambda: [(_relay.EVENT_INTERFACE_LOST, errno.ENODEV, b"")]
     )
     monkeypatch.setattr(bridge, "_relay", relay)
     bridge._release()
-    assert bridge._bus_end.bus is None
-    assert bridge._bus_end.reason.startswith("bus lost: pair")
+    assert bridge._interface.bus is None
+    assert bridge._interface.reason.startswith("bus lost: pair")
     bridge.close()
 
 

@@ -14,7 +14,7 @@ import pytest
 from test_bridge import PairBus
 
 from bridged.bridge import interface as bus_end
-from bridged.bridge.interface import RETRY_S, BusEnd
+from bridged.bridge.interface import RETRY_S, Interface
 from bridged.can import CAN_ERR_BUSERROR, CAN_ERR_CRTL, CAN_ERR_LOSTARB, error_frame
 from bridged.config import load
 from bridged.errors import BusError
@@ -30,7 +30,7 @@ DOWN = "interface vcan0 is down: ip link set vcan0 up"
 
 
 class Relay:
-    """What a BusEnd wants of one."""
+    """The part of a relay that Interface uses."""
 
     def __init__(self) -> None:
         self.bus = -1
@@ -67,7 +67,7 @@ class Bench:
         self.buses: list[LosingBus] = []
         self.error: BusError | None = None
         self.warning = ""
-        self.end = BusEnd(load(file), cast("_relay.Relay", self.relay), self.open)
+        self.end = Interface(load(file), cast("_relay.Relay", self.relay), self.open)
         monkeypatch.setattr(bus_end, "time", SimpleNamespace(monotonic=lambda: self.now))
         monkeypatch.setattr(socketcan, "is_up", lambda _channel: self.up)
 

@@ -307,12 +307,12 @@ class TestReload:
         buses: list[object] = []
 
         def change() -> None:
-            buses.append(first._bus_end.bus)
+            buses.append(first._interface.bus)
             write_config(file, port="/nowhere/other", bus=file.parent.name)
             os.kill(os.getpid(), signal.SIGHUP)
 
         def stop() -> None:
-            buses.append(made.bridge._bus_end.bus)
+            buses.append(made.bridge._interface.bus)
             os.kill(os.getpid(), signal.SIGTERM)
 
         self.run(made, [change, stop], heard)
