@@ -52,6 +52,10 @@ UNANSWERED_LOG_S = 10.0
 LAST_WORDS_S = 0.1
 STOP_S = 1.2  # for an adapter that does not answer; systemd and users wait for the end
 
+# A device that was plugged in is tried again and again so long: libusb lists it, and udev lets us open it, a
+# moment after the kernel has told of it.
+SETTLE_S, SETTLE_RETRY_S = 5.0, 0.1
+
 HAND_OVER_S = 1.0  # for frames that wait when another bridge is to take this one's place
 HAND_OVER_LOOK_S = 0.005
 
@@ -122,7 +126,7 @@ class Bridge:
         self._opened: queue.SimpleQueue[Port | Exception] = queue.SimpleQueue()
         self._opened_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._opening = False  # a thread opens the port
-        self._plugged_in = False  # since the last try
+        self._settles_by: float | None = None  # what was plugged in may not be usable before that
         self._starts = 0  # how often it began to run
         self._identity: object = None  # that was told
         self._recovery = Recovery(config, self.adapter)
@@ -221,7 +225,7 @@ class Bridge:
             self._on_event(kind, token, text)
         if self.state in AWAITING_DEVICE and self._watch.has_come():
             log.info("%s was plugged in", self.config.adapter.port)
-            self._plugged_in = True
+            self._settles_by = time.monotonic() + SETTLE_S
             self._dispatch(Verdict(Event.APPEARED))
 
     def next_timer(self) -> float | None:
@@ -380,8 +384,9 @@ class Bridge:
         self.state, actions = transition(before, verdict.event)
         if verdict.event is Event.CLOSED:
             self.channel_open = self._exchanges.last_reply is Reply.NONE
-        if before is State.RUNNING and self.state is not before:
+        if before in {State.RUNNING, State.OPENING} and self.state is not before:
             self._pause_s = verdict.pause_s
+        if before is State.RUNNING and self.state is not before:
             self._restarts = self._restarts or verdict.off_bus
         if self.state is not before:
             self._log_transition(verdict.reason)
@@ -486,14 +491,13 @@ class Bridge:
             if not self.finished:
                 self._watch.arm()  # before the look, or it might come between
             there = self._watch.is_there()
-            self._dispatch(Verdict(Event.OPEN_FAILED if there else Event.ABSENT, str(result)))
-            if there and self._plugged_in and self.state is State.BACKOFF:
-                self._plugged_in = False  # it was opened in the middle of that, and is not told again
-                self._dispatch(Verdict(Event.APPEARED))
+            settles = self._settles_by is not None and time.monotonic() < self._settles_by
+            pause_s = SETTLE_RETRY_S if settles else None
+            self._dispatch(Verdict(Event.OPEN_FAILED if there else Event.ABSENT, str(result), pause_s))
             return
         if isinstance(result, Exception):
             raise result
-        self._plugged_in = False
+        self._settles_by = None
         try:
             self._relay.attach_port(result.fd)
         except OSError as error:  # no descriptor is left for it
