@@ -13,20 +13,7 @@ import enum
 import struct
 from typing import NamedTuple
 
-CAN232_STANDARD_BITRATES = {
-    10_000: "S0",
-    20_000: "S1",
-    50_000: "S2",
-    100_000: "S3",
-    125_000: "S4",
-    250_000: "S5",
-    500_000: "S6",
-    800_000: "S7",
-    1_000_000: "S8",
-}
-"""bit/s → command (CAN232 manual, `Sn`). Some clones set 750 kbit/s for S7."""
-
-_STANDARD_REGISTERS = {
+STANDARD_REGISTERS = {
     10_000: (0x31, 0x1C),
     20_000: (0x18, 0x1C),
     50_000: (0x09, 0x1C),
@@ -72,13 +59,7 @@ class BitTiming(NamedTuple):
     @property
     def register_pair(self) -> tuple[int, int]:
         """BTR0 and BTR1, also of a bit rate that some adapters have a command for: (0x03, 0x1C)."""
-        return self.registers or _STANDARD_REGISTERS[self.bitrate]
-
-    def can232_command(self) -> bytes:
-        r"""`S4\r` or `s031C\r` (CAN232 manual, S and s)."""
-        if self.registers is None:
-            return f"{CAN232_STANDARD_BITRATES[self.bitrate]}\r".encode()
-        return f"s{self.registers[0]:02X}{self.registers[1]:02X}\r".encode()
+        return self.registers or STANDARD_REGISTERS[self.bitrate]
 
     @classmethod
     def from_registers(cls, btr0: int, btr1: int, clock_hz: int = CLOCK_HZ) -> BitTiming:

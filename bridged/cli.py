@@ -139,19 +139,14 @@ def _check_one(path: Path) -> None:
     config, warnings = check(path)
     for warning in warnings:
         print(printable(warning), file=sys.stderr)
-    adapter: Any = config.adapter
-    channel, bus = config.channel, config.bus
-    rate = f" at {adapter.baudrate} Bd" if adapter.type == "can232" else ""
+    adapter, channel, bus = config.adapter, config.channel, config.bus
     print(
-        f"{printable(str(config.path))}: OK: {adapter.type} on {adapter.port}{rate}, "
+        f"{printable(str(config.path))}: OK: {adapter.type} on {adapter.where}, "
         f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
         f"to {bus.interface} {bus.channel}"
     )
-    if adapter.type == "can232":
-        from bridged.adapters.can232 import notes  # noqa: PLC0415
-
-        for note in notes(adapter, channel):
-            print(f"  {note}")
+    for note in adapter.notes(channel):
+        print(f"  {note}")
 
 
 def _status_paths(args: argparse.Namespace) -> list[Path]:

@@ -1,16 +1,18 @@
 """The configuration: a YAML file becomes frozen, typed values, or a list of all that is wrong with it."""
 
+import functools
 import os
 import re
+from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from bridged import can
-from bridged.ports.names import USB_DEVICE, is_numbered_terminal, port_problem
+from bridged import adapters, can
+from bridged.ports.names import PortName
 from bridged.settings import (
     AdapterConfig,
     BusConfig,
@@ -32,29 +34,10 @@ from bridged.yaml_source import (
     scalar_value,
 )
 
-CRITICAL_LIMIT, READY_LIMIT = 15, 7
-"""Frames. Known to work, and with the fewest ERROR messages of the pairs that were tried on a real one."""
-
 LONG_DEADLINE_S = 10.0
-CAN232_COMMANDS = 2
-"""What its serial buffer holds: CAN232 manual."""
-
 # --- The schema. A description completes "expected …, got the text 'fast'". ----------------------
 
-ADAPTER_TYPES = Meta(description="can232 or usb2can")
 Flag = Annotated[bool, Meta(description="true or false")]
-Port = Annotated[
-    str, Meta(min_length=1, description="a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT")
-]
-Baudrate = Annotated[int, Meta(ge=50, le=4_000_000, description="a UART rate from 50 to 4000000 bit/s")]
-SerialNumber = Annotated[
-    str, Meta(pattern="^[!-~]{1,32}$", description="the serial number that the device reports")
-]
-Firmware = Annotated[Literal["can232"], Meta(description="can232")]
-CriticalLimit = Annotated[int, Meta(ge=2, le=18, description="a number of frames from 2 to 18")]
-ReadyLimit = Annotated[
-    int, Meta(ge=1, le=17, description="a number of frames from 1 to 17")
-]  # below 1 never "go"
 Bitrate = Annotated[
     int,
     Meta(
@@ -83,54 +66,6 @@ Window = Annotated[int, Meta(ge=1, le=32, description="a number of unanswered fr
 Interval = Annotated[float, Meta(ge=0.1, le=0.5, description="a number of seconds from 0.1 to 0.5")]
 Pause = Annotated[float, Meta(ge=0.01, le=3600, description="a number of seconds from 0.01 to 3600")]
 Deadline = Annotated[float, Meta(gt=0, le=3600, description="a number of seconds above 0 and up to 3600")]
-
-
-class _AdapterKeys(Struct, frozen=True, kw_only=True):
-    type: Annotated[Literal["can232", "usb2can"], ADAPTER_TYPES]
-    port: Port
-    baudrate: Baudrate | None = None
-    serial_number: SerialNumber | None = None
-    firmware: Firmware | None = None
-    critical_limit: CriticalLimit | None = None
-    ready_limit: ReadyLimit | None = None
-
-
-class Can232Config(AdapterConfig, frozen=True, kw_only=True):
-    """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s.
-
-    `firmware` "can232": what is there is a CAN232 for certain; None: it may be a clone, and is treated so
-    until it has said what it is.
-    """
-
-    default_window: ClassVar[int] = 1
-    default_restart_s: ClassVar[float] = 0.1
-
-    type: Annotated[Literal["can232"], ADAPTER_TYPES]
-    port: Port
-    baudrate: Baudrate = 57_600
-    serial_number: SerialNumber | None = None
-    firmware: Firmware | None = None
-
-
-class Usb2canConfig(AdapterConfig, frozen=True, kw_only=True):
-    """A USB2CAN, and how to reach it. `port` is an absolute path, socket:// or usb://VID:PID[/SERIAL].
-
-    With so many frames in its transmit buffer the adapter says stop (`critical_limit`) and go on
-    (`ready_limit`, always below): USB2CAN document, COMMAND 0 and 1. `serial_number` is the USB device's.
-    """
-
-    default_window: ClassVar[int] = 16
-    default_restart_s: ClassVar[float] = 0.0  # it restarts itself
-
-    type: Annotated[Literal["usb2can"], ADAPTER_TYPES]
-    port: Port
-    serial_number: SerialNumber | None = None
-    critical_limit: CriticalLimit = CRITICAL_LIMIT
-    ready_limit: ReadyLimit = READY_LIMIT
-
-    @property
-    def usb_serial_number(self) -> str | None:
-        return self.serial_number
 
 
 class _AcceptanceKeys(Struct, frozen=True, kw_only=True):
@@ -172,7 +107,6 @@ class _ReconnectKeys(Struct, frozen=True, kw_only=True):
 
 
 _SECTIONS: dict[str, type[Struct]] = {
-    "adapter": _AdapterKeys,
     "channel": _ChannelKeys,
     "channel.acceptance": _AcceptanceKeys,
     "bus": _BusKeys,
@@ -180,21 +114,24 @@ _SECTIONS: dict[str, type[Struct]] = {
     "health": _HealthKeys,
     "reconnect": _ReconnectKeys,
 }
+_TOP = ("adapter", *(path for path in _SECTIONS if "." not in path))
 
-_ADAPTERS: dict[str, type[Can232Config | Usb2canConfig]] = {"can232": Can232Config, "usb2can": Usb2canConfig}
 
-_SPOKEN_BY_CAN232 = ("slcan", "slcand", "lawicel")
+@functools.cache
+def _keys_of_all_adapters() -> type[Struct]:
+    """Section `adapter` with every key that any type has. For a file that is wrong: loads all adapters."""
+    names = Meta(pattern=f"^({'|'.join(adapters.TYPES)})$", description=" or ".join(adapters.TYPES))
+    keys: dict[str, tuple[str, Any] | tuple[str, Any, Any]] = {"type": ("type", Annotated[str, names])}
+    for type_ in adapters.TYPES:
+        for field in msgspec.structs.fields(adapters.settings_of(type_)):
+            required = (field.name, field.type)
+            keys.setdefault(field.name, required if field.required else (*required, None))
+    return msgspec.defstruct("_AdapterKeys", keys.values(), kw_only=True)
 
-_KEYS_OF_OTHERS = {
-    "can232": {
-        "critical_limit": "goes with type: usb2can; remove it",
-        "ready_limit": "goes with type: usb2can; remove it",
-    },
-    "usb2can": {
-        "baudrate": "a USB2CAN has no baud rate, there is no serial line in it: remove it",
-        "firmware": "goes with type: can232; remove it",
-    },
-}
+
+def _schemas() -> dict[str, type[Struct]]:
+    return {"adapter": _keys_of_all_adapters(), **_SECTIONS}
+
 
 _RESERVED_OPTIONS = {
     "bustype": "write interface",
@@ -216,7 +153,7 @@ def check(path: str | os.PathLike[str]) -> tuple[Config, list[str]]:
     config, top = _load(Path(path))
     adapter, transmit = config.adapter, config.transmit
     section = top.section("adapter")
-    if section and is_numbered_terminal(adapter.port):
+    if section and PortName(adapter.port).is_numbered_terminal:
         text = (
             "the next terminal gets this name when this one ends: use one that stays, as of simulate --link"
         )
@@ -224,9 +161,8 @@ def check(path: str | os.PathLike[str]) -> tuple[Config, list[str]]:
     section = top.section("transmit") if "transmit" in top.nodes else None
     if section and transmit.deadline_s > LONG_DEADLINE_S:
         section.warn_key("deadline", f"a frame may reach the bus {transmit.deadline_s:g} s after it was sent")
-    if section and isinstance(adapter, Can232Config) and transmit.window > CAN232_COMMANDS:
-        text = f"a CAN232 can hold {CAN232_COMMANDS} commands, more of them may be lost"
-        section.warn_key("window", text)
+    if section and (warning := adapter.window_warning(transmit)):
+        section.warn_key("window", warning)
     section = top.section("bus")
     if section and config.bus.create and re.fullmatch(r"can\d+", config.bus.channel):
         text = "a virtual interface of this name is made if there is none, so a real one cannot have it"
@@ -260,7 +196,7 @@ def _load(file: Path) -> tuple[Config, Section]:
         line, column = (0, 0) if root is None else (root.start_mark.line, root.start_mark.column)
         problems.add(line, column, f"{what}; expected sections adapter, channel and bus")
         raise problems.error()
-    top = Section(root, _SECTIONS, problems)
+    top = Section(root, _schemas, problems)
     config = _read_file(file, top)
     if config is None:
         raise problems.error()
@@ -268,7 +204,7 @@ def _load(file: Path) -> tuple[Config, Section]:
 
 
 def _read_file(path: Path, top: Section) -> Config | None:
-    top.refuse_unknown([path for path in _SECTIONS if "." not in path])
+    top.refuse_unknown(list(_TOP))
     adapter = _read_adapter(top.section("adapter"))
     channel_section = top.section("channel")
     channel = _read_channel(channel_section, adapter)
@@ -309,88 +245,82 @@ def _read_plain(section: Section | None, schema: type[Struct], settings: type[_S
     return settings(**values) if complete else None
 
 
-def _read_adapter(section: Section | None) -> Can232Config | Usb2canConfig | None:
+def _read_adapter(section: Section | None) -> AdapterConfig | None:
     if section is None:
         return None
-    node = section.nodes.get("type")
-    if isinstance(node, ScalarNode) and node.value.lower() in _SPOKEN_BY_CAN232:
-        meant = f"a CAN232 speaks what {quoted(node.value)} names, LAWICEL's protocol: write type: can232"
-        section.refuse_value("type", meant)
-        node.value = "can232"  # for the other keys
-    type_: str | None = node.value if isinstance(node, ScalarNode) and node.value in _ADAPTERS else None
-    adapter: Can232Config | Usb2canConfig | None = None
+    type_ = _adapter_type(section)
     if type_ is None:
-        section.read(_AdapterKeys)
-    else:
-        for key, why in _KEYS_OF_OTHERS[type_].items():
-            if key in section.keys:
-                section.refuse_key(key, why)
-                del section.keys[key]  # or it would be reported as unknown too
-        adapter = _read_plain(section, _ADAPTERS[type_], _ADAPTERS[type_])
-    if text := port_problem(section.values.get("port", "/"), type_):
+        section.read(_keys_of_all_adapters())
+        if text := PortName(section.values.get("port", "/")).problem():
+            section.refuse_value("port", text)
+        return None
+    settings = adapters.settings_of(type_)
+    if not section.keys.keys() <= set(key_names(settings)):
+        _refuse_keys_of_others(section, settings, type_)
+    adapter = _read_plain(section, settings, settings)
+    port = PortName(section.values.get("port", "/"))
+    if text := port.problem(settings.schemes, settings.refused_schemes):
         section.refuse_value("port", text)
-    if type_ == "usb2can":
-        _check_serial_number(section)
-        _check_limits(section)
+    if settings.identified_by_usb:
+        _check_usb_serial_number(section, port)
+    for key, text in settings.problems(section.values, section.nodes):
+        section.refuse_value(key, text)
     return adapter
 
 
-def _check_serial_number(section: Section) -> None:
-    """Report one that could not be kept to: a USB2CAN has no command that tells it, only USB knows it."""
+def _adapter_type(section: Section) -> str | None:
+    """The type of the adapter, also of one that is meant by another name; None if it is none."""
+    node = section.nodes.get("type")
+    if not isinstance(node, ScalarNode):
+        return None
+    if node.value in adapters.TYPES:
+        return str(node.value)
+    for type_ in adapters.TYPES:
+        settings = adapters.settings_of(type_)
+        if node.value.lower() in settings.other_names:
+            section.refuse_value("type", settings.other_names_advice.format(quoted(node.value)))
+            node.value = type_  # for the other keys
+            return type_
+    return None
+
+
+def _refuse_keys_of_others(section: Section, settings: type[AdapterConfig], type_: str) -> None:
+    """Report keys that only other types of adapter have. Loads all adapters."""
+    own = key_names(settings)
+    for key in [key for key in section.keys if key not in own]:
+        homes = [
+            other
+            for other in adapters.TYPES
+            if other != type_ and key in key_names(adapters.settings_of(other))
+        ]
+        if homes:
+            default = f"goes with type: {' or '.join(homes)}; remove it"
+            section.refuse_key(key, settings.refused_keys.get(key, default))
+            del section.keys[key]  # or it would be reported as unknown too
+
+
+def _check_usb_serial_number(section: Section, port: PortName) -> None:
+    """Report one that could not be kept to: the device itself does not tell it, only USB knows it."""
     serial_number = section.values.get("serial_number")
-    scheme, _, device = section.values.get("port", "").partition("://")
     if serial_number is None:
         return
-    if scheme == "socket":
+    if port.scheme == "socket":
         section.refuse_key("serial_number", "is the USB device's, unknown through socket://; remove it")
-    match = USB_DEVICE.fullmatch(device)
-    if scheme == "usb" and match and match[1] not in (None, serial_number):
-        text = f"{quoted(serial_number)} is not the one in port, {quoted(match[1])}; remove one of them"
-        section.refuse_value("serial_number", text)
+    if port.serial_number is not None and port.serial_number != serial_number:
+        other = f"is not the one in port, {quoted(port.serial_number)}"
+        section.refuse_value("serial_number", f"{quoted(serial_number)} {other}; remove one of them")
 
 
-def _check_limits(section: Section) -> None:
-    """Report limits that would have the adapter say go on before it says stop."""
-    given = [key for key in ("critical_limit", "ready_limit") if key in section.nodes]
-    if any(key not in section.values for key in given):  # reported already
-        return
-    critical = section.values.get("critical_limit", CRITICAL_LIMIT)
-    ready = section.values.get("ready_limit", READY_LIMIT)
-    if ready < critical:
-        return
-    default = ", its default" if len(given) == 1 else ""
-    if "ready_limit" in given:
-        text = f"expected a limit below critical_limit ({critical}{default}), got {ready}"
-    else:
-        text = f"expected a limit above ready_limit ({ready}{default}), got {critical}"
-    section.refuse_value(given[-1], text)
-
-
-def _read_transmit(
-    section: Section | None, adapter: Can232Config | Usb2canConfig | None
-) -> TransmitConfig | None:
+def _read_transmit(section: Section | None, adapter: AdapterConfig | None) -> TransmitConfig | None:
     """Read `transmit`; without the section, and for what it leaves out, its defaults."""
     keys = _read_plain(section, _TransmitKeys, _TransmitKeys) or _TransmitKeys()
     if adapter is None:
         return None
     window = adapter.default_window if keys.window is None else keys.window
     transmit = TransmitConfig(queue=keys.queue, window=window, deadline_s=keys.deadline_s)
-    if section and isinstance(adapter, Can232Config) and (text := _window_problem(adapter, transmit)):
+    if section and (text := adapter.window_problem(transmit)):
         section.refuse_value("window", text)
     return transmit
-
-
-def _window_problem(adapter: Can232Config, transmit: TransmitConfig) -> str | None:
-    """The frames of a window lie in the line, where they grow old uncounted: 27 characters each."""
-    if transmit.window == 1 or "://" in adapter.port:
-        return None
-    frame_s = 27 * 10 / adapter.baudrate
-    room = max(1, int(transmit.deadline_s / 2 / frame_s))
-    if transmit.window <= room:
-        return None
-    taken = f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {adapter.baudrate} Bd"
-    limit = f"more than half of the deadline of {transmit.deadline_s:g} s"
-    return f"{taken}, {limit}, so they could be sent late; at most {room}"
 
 
 def _read_reconnect(top: Section) -> ReconnectConfig | None:
@@ -404,13 +334,11 @@ def _read_reconnect(top: Section) -> ReconnectConfig | None:
     return reconnect
 
 
-def _read_channel(
-    section: Section | None, adapter: Can232Config | Usb2canConfig | None
-) -> ChannelConfig | None:
+def _read_channel(section: Section | None, adapter: AdapterConfig | None) -> ChannelConfig | None:
     if section is None:
         return None
     values = section.read(_ChannelKeys)
-    timing = _read_timing(section)
+    timing = _read_timing(section, adapter.bitrates if adapter else can.STANDARD_REGISTERS)
     acceptance = None
     if "acceptance" in section.nodes and (
         keys := _read_plain(section.section("acceptance", required=False), _AcceptanceKeys, _AcceptanceKeys)
@@ -431,14 +359,14 @@ def _read_channel(
     )
 
 
-def _read_timing(section: Section) -> can.BitTiming | None:
+def _read_timing(section: Section, bitrates: Collection[int]) -> can.BitTiming | None:
     """Make the bit timing of `bitrate` (and `sample_point`), or of `btr0` and `btr1`."""
     registers = [key for key in ("btr0", "btr1") if key in section.nodes]
     if "bitrate" in section.nodes:
         if registers:
             section.refuse_key(registers[0], "excludes bitrate; give bitrate, or btr0 and btr1")
             return None
-        return _timing_of_bitrate(section)
+        return _timing_of_bitrate(section, bitrates)
     if not registers:
         section.refuse_missing("bitrate", "a bit rate in bit/s (or btr0 and btr1)")
         return None
@@ -458,12 +386,12 @@ def _read_timing(section: Section) -> can.BitTiming | None:
         return None
 
 
-def _timing_of_bitrate(section: Section) -> can.BitTiming | None:
+def _timing_of_bitrate(section: Section, bitrates: Collection[int]) -> can.BitTiming | None:
     bitrate: int | None = section.values.get("bitrate")
     sample_point: float | None = section.values.get("sample_point")
     if bitrate is None:
         return None
-    if bitrate in can.CAN232_STANDARD_BITRATES and sample_point is None:
+    if bitrate in bitrates and sample_point is None:
         return can.BitTiming(bitrate)
     try:
         can.require_bitrate(bitrate)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - msgspec looks at the annotations
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping  # noqa: TC003 - msgspec looks at the annotations
+from pathlib import Path  # noqa: TC003 - as above
+from typing import Any, ClassVar
 
 from msgspec import Struct
 
@@ -11,10 +12,49 @@ from bridged.can import AcceptanceFilter, BitTiming  # noqa: TC001 - as above
 
 
 class AdapterConfig(Struct, frozen=True, kw_only=True):
-    """An adapter, and how to reach it. Each type of adapter has a subclass, with the keys of its own."""
+    """An adapter, and how to reach it: section `adapter` of a file.
+
+    Each type of adapter has a subclass in adapters/: with the keys of its own, and with the rest below that
+    config.py asks of it.
+    """
 
     type: str
     port: str
+
+    default_window: ClassVar[int]  # of section transmit, in frames
+    default_restart_s: ClassVar[float | None]  # of section channel: see ChannelConfig
+    bitrates: ClassVar[Collection[int]]  # bit/s, those that take no BTR0 and BTR1
+    identified_by_usb: ClassVar[bool] = False  # a key `serial_number` means the USB device behind `port`
+    schemes: ClassVar[tuple[str, ...]]  # URLs that `port` may have
+    refused_schemes: ClassVar[Mapping[str, str]] = {}  # why it may not have another, and what to do
+    refused_keys: ClassVar[Mapping[str, str]] = {}  # the same of keys that other types of adapter have
+    other_names: ClassVar[tuple[str, ...]] = ()  # that somebody might give as its `type`, in lower case
+    other_names_advice: ClassVar[str] = ""  # what to do then, with `{}` for that name
+
+    @classmethod
+    def problems(cls, values: Mapping[str, Any], given: Collection[str]) -> Iterable[tuple[str, str]]:  # noqa: ARG003
+        """A key and what is wrong with it, of `values` that are right by themselves but not together.
+
+        `given`: all keys of the section, also those whose values are wrong by themselves.
+        """
+        return ()
+
+    def window_problem(self, transmit: TransmitConfig) -> str | None:  # noqa: ARG002
+        """Why the adapter cannot be used with this window."""
+        return None
+
+    def window_warning(self, transmit: TransmitConfig) -> str | None:  # noqa: ARG002
+        """Why this window is probably not meant."""
+        return None
+
+    def notes(self, channel: ChannelConfig) -> list[str]:  # noqa: ARG002
+        """Lines that somebody should know before the adapter is used with these settings."""
+        return []
+
+    @property
+    def where(self) -> str:
+        """The port, with the rate of its line if it has one: `/dev/ttyUSB0 at 57600 Bd`."""
+        return self.port
 
     @property
     def usb_serial_number(self) -> str | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from msgspec import Struct
     from msgspec.structs import FieldInfo
 
-Schemas = Mapping[str, "type[Struct]"]
+Schemas = Callable[[], Mapping[str, "type[Struct]"]]
 
 MAX_BYTES = 65_536
 """Far above any configuration; keeps a wrong path (/dev/zero, a log file) from being read to its end."""
@@ -213,7 +213,8 @@ def _as_number(text: str) -> str | None:
 class Section:
     """A mapping while it is read: where its keys and values are, and the values that are right by themselves.
 
-    `schemas` has the Struct of each section, by path: `channel.acceptance`.
+    `schemas` gives the Struct of each section, by path: `channel.acceptance`. Only a file that is wrong
+    has it called.
     """
 
     def __init__(
@@ -275,7 +276,7 @@ class Section:
                 )
 
     def _meant(self, key: str, allowed: list[str]) -> str:
-        homes = [path for path, schema in self._schemas.items() if key in key_names(schema)]
+        homes = [path for path, schema in self._schemas().items() if key in key_names(schema)]
         if homes:
             return f", it belongs to {' or '.join(homes)}"
         import difflib  # noqa: PLC0415 - only for a file that is wrong
@@ -286,15 +287,15 @@ class Section:
     def section(self, key: str, *, required: bool = True) -> Section | None:
         """Return a section below; None, reported, if it is missing or not a mapping."""
         path = self._below(key)
-        schema = self._schemas[path]
+        node = self.nodes.get(key)
+        if isinstance(node, MappingNode) and not foreign_tag(node):
+            return Section(node, self._schemas, self.problems, path=path, parent=self.keys[key])
+        schema = self._schemas()[path]
         needed = [field.encode_name for field in msgspec.structs.fields(schema) if field.required]
         wanted = f"a section with {', '.join(needed or key_names(schema))}"
-        node = self.nodes.get(key)
         if node is None:
             self.refuse_missing(key, wanted)
         elif self._is_usable(key, wanted, required=required):
-            if isinstance(node, MappingNode):
-                return Section(node, self._schemas, self.problems, path=path, parent=self.keys[key])
             self.refuse_value(key, f"expected {wanted}, got {describe(node)}")
         return None
 

@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Generator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Protocol
+
+from msgspec import Meta
 
 if TYPE_CHECKING:
     from bridged.can import BusState
+
+# Keys that several types of adapter have. A description completes "expected …, got the text 'fast'".
+TypeName = Annotated[str, Meta(description="the name of a type of adapter")]
+PortText = Annotated[
+    str, Meta(min_length=1, description="a device path like /dev/ttyUSB0 or a URL like socket://HOST:PORT")
+]
+Baudrate = Annotated[int, Meta(ge=50, le=4_000_000, description="a UART rate from 50 to 4000000 bit/s")]
+SerialNumber = Annotated[
+    str, Meta(pattern="^[!-~]{1,32}$", description="the serial number that the device reports")
+]
 
 
 class Reply(enum.Enum):

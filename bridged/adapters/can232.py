@@ -5,11 +5,15 @@ from __future__ import annotations
 import functools
 import logging
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping  # noqa: TC003 - msgspec looks at the annotations
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+
+from msgspec import Meta
 
 from bridged.adapters.base import (
     UNKNOWN,
     Answer,
+    Baudrate,
     Exchange,
     Flow,
     Happened,
@@ -17,19 +21,23 @@ from bridged.adapters.base import (
     Memory,
     Observation,
     Polling,
+    PortText,
     Reply,
+    SerialNumber,
     Steps,
+    TypeName,
     pause,
 )
 from bridged.can import BusState
 from bridged.errors import AdapterError, WrongDeviceError
+from bridged.settings import AdapterConfig
 from bridged.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping, Sequence
+    from collections.abc import Generator, Sequence
 
-    from bridged.config import Can232Config
-    from bridged.settings import ChannelConfig
+    from bridged.can import BitTiming
+    from bridged.settings import ChannelConfig, TransmitConfig
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +49,7 @@ RECEIVE_FIFO = 32  # frames that may be on their way out before an answer (manua
 AUTO_POLL_SINCE = "1220"  # hhss of the first firmware with X (manual 2.0, P and A)
 POLL_INTERVAL_S = 0.01
 TRANSMIT_FIFO = 8  # frames (manual 1.3)
+COMMANDS_MAX = 2  # that the buffer of its serial line holds (manual)
 LONGEST_FRAME_BITS = 160  # extended, 8 bytes, as many stuff bits as there can be, the pause behind it
 
 # A command that a crashed program left half typed may be in the device's buffer. A CR would finish it: a
@@ -113,6 +122,94 @@ HAPPENED = {
     6: Happened.ARBITRATION_LOST,
     7: Happened.BUS_ERROR,
 }
+
+BITRATE_COMMANDS: Final = {
+    10_000: "S0",
+    20_000: "S1",
+    50_000: "S2",
+    100_000: "S3",
+    125_000: "S4",
+    250_000: "S5",
+    500_000: "S6",
+    800_000: "S7",
+    1_000_000: "S8",
+}
+"""bit/s → command (manual, `Sn`). Some clones set 750 kbit/s for S7."""
+
+Firmware = Annotated[Literal["can232"], Meta(description="can232")]
+
+
+class Can232Config(AdapterConfig, frozen=True, kw_only=True):
+    """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s.
+
+    `firmware` "can232": what is there is a CAN232 for certain; None: it may be a clone, and is treated so
+    until it has said what it is.
+    """
+
+    type: TypeName
+    port: PortText
+    baudrate: Baudrate = 57_600
+    serial_number: SerialNumber | None = None  # of the CAN232 itself, which the USB device has not
+    firmware: Firmware | None = None
+
+    default_window: ClassVar[int] = 1
+    default_restart_s: ClassVar[float | None] = 0.1
+    bitrates = BITRATE_COMMANDS.keys()
+    schemes: ClassVar[tuple[str, ...]] = ("socket", "rfc2217")
+    refused_schemes: ClassVar[Mapping[str, str]] = {
+        "usb": "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"
+    }
+    other_names: ClassVar[tuple[str, ...]] = ("slcan", "slcand", "lawicel")
+    other_names_advice: ClassVar[str] = (
+        "a CAN232 speaks what {} names, LAWICEL's protocol: write type: can232"
+    )
+
+    def window_problem(self, transmit: TransmitConfig) -> str | None:
+        """The frames of a window lie in the line, where they grow old uncounted: 27 characters each."""
+        if transmit.window == 1 or not self.port.startswith("/"):
+            return None
+        frame_s = LONGEST_LINE * 10 / self.baudrate
+        room = max(1, int(transmit.deadline_s / 2 / frame_s))
+        if transmit.window <= room:
+            return None
+        taken = f"{transmit.window} frames take {transmit.window * frame_s:.2g} s at {self.baudrate} Bd"
+        limit = f"more than half of the deadline of {transmit.deadline_s:g} s"
+        return f"{taken}, {limit}, so they could be sent late; at most {room}"
+
+    def window_warning(self, transmit: TransmitConfig) -> str | None:
+        if transmit.window <= COMMANDS_MAX:
+            return None
+        return f"a CAN232 can hold {COMMANDS_MAX} commands, more of them may be lost"
+
+    def notes(self, channel: ChannelConfig) -> list[str]:
+        """What may be written to the EEPROM, and what becomes of a clone."""
+        stored = ["X1", "Z0"]
+        acceptance = channel.acceptance
+        if acceptance is not None and not acceptance.passes_all:
+            stored.append(f"W{acceptance.single:d}")
+        names = ", ".join(f"{request} ({EEPROM_NAMES[request]})" for request in stored)
+        lines = [f"may store in the adapter's EEPROM, each only if it is not so already: {names}"]
+        if self.firmware is None:
+            lines.append("a clone that is recognised is refused at start, unless adapter.firmware is can232")
+        return lines
+
+    @property
+    def where(self) -> str:
+        return f"{self.port} at {self.baudrate} Bd"
+
+
+SETTINGS = Can232Config
+
+
+def make_adapter(settings: Can232Config, channel: ChannelConfig, memory: Memory) -> Can232:
+    return Can232(settings, channel, memory)
+
+
+def bitrate_command(timing: BitTiming) -> bytes:
+    r"""`S4\r` or `s031C\r` (manual, S and s)."""
+    if timing.registers is None:
+        return f"{BITRATE_COMMANDS[timing.bitrate]}\r".encode()
+    return "s{:02X}{:02X}\r".format(*timing.registers).encode()
 
 
 class Can232:
@@ -323,7 +420,7 @@ class Can232:
 
     def _configure(self) -> Steps:
         timing = self._channel.timing
-        bitrate = timing.can232_command()
+        bitrate = bitrate_command(timing)
         yield self._step(
             bitrate,
             f"set the bit rate ({bitrate[:-1].decode()}, {timing.description})",
@@ -425,19 +522,6 @@ def _name_of(answer: bytes, names: Mapping[bytes, str]) -> str | None:
 def _shown(answer: bytes) -> str:
     text = printable(answer.decode("ascii", "replace"))
     return f"'{text}'" if len(text) <= LONGEST_SHOWN else f"'{text[:LONGEST_SHOWN]}…'"
-
-
-def notes(adapter: Can232Config, channel: ChannelConfig) -> list[str]:
-    """What somebody should know before the adapter is used with these settings."""
-    stored = ["X1", "Z0"]
-    acceptance = channel.acceptance
-    if acceptance is not None and not acceptance.passes_all:
-        stored.append(f"W{acceptance.single:d}")
-    names = ", ".join(f"{request} ({EEPROM_NAMES[request]})" for request in stored)
-    lines = [f"may store in the adapter's EEPROM, each only if it is not so already: {names}"]
-    if adapter.firmware is None:
-        lines.append("a clone that is recognised is refused at start, unless adapter.firmware is can232")
-    return lines
 
 
 @functools.lru_cache(maxsize=16)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Collection, Iterable, Mapping  # noqa: TC003 - msgspec looks at the annotations
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
+
+from msgspec import Meta
 
 from bridged.adapters.base import (
     UNKNOWN,
@@ -15,17 +18,21 @@ from bridged.adapters.base import (
     Identity,
     Observation,
     Polling,
+    PortText,
     Reply,
+    SerialNumber,
     Steps,
+    TypeName,
     pause,
 )
-from bridged.can import BusState, state_of
+from bridged.can import STANDARD_REGISTERS, BusState, state_of
 from bridged.errors import AdapterError, WrongDeviceError
+from bridged.settings import AdapterConfig
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
-    from bridged.config import Usb2canConfig
+    from bridged.adapters.base import Memory
     from bridged.settings import ChannelConfig
 
 log = logging.getLogger(__name__)
@@ -91,6 +98,68 @@ def _exchange(request: bytes, purpose: str, prefix: bytes, *, optional: bool = F
     """A request and the beginning of its answer; an `optional` one may be missing."""
     accept, reject = ((TEXT, NONE), ()) if optional else ((TEXT,), (NONE,))
     return Exchange(request, purpose, accept, reject, prefix, timeout_s=ANSWER_TIMEOUT_S)
+
+
+DEFAULT_CRITICAL, DEFAULT_READY = 15, 7
+"""Frames. Known to work, and with the fewest ERROR messages of the pairs that were tried on a real one."""
+
+CriticalLimit = Annotated[int, Meta(ge=2, le=18, description="a number of frames from 2 to 18")]
+# With a ready limit of 0 the adapter would never say "go on" again.
+ReadyLimit = Annotated[int, Meta(ge=1, le=17, description="a number of frames from 1 to 17")]
+
+
+class Usb2canConfig(AdapterConfig, frozen=True, kw_only=True):
+    """A USB2CAN, and how to reach it. `port` is an absolute path, socket:// or usb://VID:PID[/SERIAL].
+
+    With so many frames in its transmit buffer the adapter says stop (`critical_limit`) and go on
+    (`ready_limit`, always below): USB2CAN document, COMMAND 0 and 1.
+    """
+
+    type: TypeName
+    port: PortText
+    serial_number: SerialNumber | None = None
+    critical_limit: CriticalLimit = DEFAULT_CRITICAL
+    ready_limit: ReadyLimit = DEFAULT_READY
+
+    default_window: ClassVar[int] = 16
+    default_restart_s: ClassVar[float | None] = 0.0  # it restarts itself
+    bitrates = STANDARD_REGISTERS.keys()
+    identified_by_usb: ClassVar[bool] = True  # no command tells its serial number
+    schemes: ClassVar[tuple[str, ...]] = ("socket", "usb")
+    refused_schemes: ClassVar[Mapping[str, str]] = {
+        "rfc2217": "rfc2217:// sets the baud rate of a serial line, and a USB2CAN has none; write socket://"
+    }
+    refused_keys: ClassVar[Mapping[str, str]] = {
+        "baudrate": "a USB2CAN has no baud rate, there is no serial line in it: remove it"
+    }
+
+    @classmethod
+    def problems(cls, values: Mapping[str, Any], given: Collection[str]) -> Iterable[tuple[str, str]]:
+        """Limits that would have the adapter say go on before it says stop."""
+        limits = [key for key in ("critical_limit", "ready_limit") if key in given]
+        if any(key not in values for key in limits):  # reported already
+            return
+        critical = values.get("critical_limit", DEFAULT_CRITICAL)
+        ready = values.get("ready_limit", DEFAULT_READY)
+        if ready < critical:
+            return
+        default = ", its default" if len(limits) == 1 else ""
+        if "ready_limit" in limits:
+            text = f"expected a limit below critical_limit ({critical}{default}), got {ready}"
+        else:
+            text = f"expected a limit above ready_limit ({ready}{default}), got {critical}"
+        yield limits[-1], text
+
+    @property
+    def usb_serial_number(self) -> str | None:
+        return self.serial_number
+
+
+SETTINGS = Usb2canConfig
+
+
+def make_adapter(settings: Usb2canConfig, channel: ChannelConfig, memory: Memory) -> Usb2can:  # noqa: ARG001
+    return Usb2can(settings, channel)
 
 
 class Usb2can:

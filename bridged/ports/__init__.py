@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+from bridged.ports.names import PortName
+
 if TYPE_CHECKING:
     from bridged.errors import BridgeError
 
@@ -29,10 +31,11 @@ def open_port(port: str, baudrate: int) -> Port:
 
     `baudrate` in bit/s; a USB FIFO has none. Raises PortError, with what to do about it.
     """
-    if port.startswith("usb://"):
+    name = PortName(port)
+    if name.scheme == "usb":
         from bridged.ports.usb import open_usb  # noqa: PLC0415 - libusb only where a port needs it
 
-        return open_usb(port)
+        return open_usb(name)
     from bridged.ports.serial import open_serial  # noqa: PLC0415 - pyserial only where a port is opened
 
-    return open_serial(port, baudrate)
+    return open_serial(name, baudrate)

@@ -16,12 +16,12 @@ import termios
 import threading
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import urlsplit
 
 import serial
 
 from bridged.errors import BridgeError, PortError
 from bridged.ports import sysfs
+from bridged.ports.names import PortName
 from bridged.ports.pump import POLL_INTERVAL_S, Pump
 
 _log = logging.getLogger(__name__)
@@ -52,16 +52,17 @@ _BLOCK: Final = 4096
 _BACKLOG_MAX: Final = 1_000_000  # bytes of a pumped port that were not read yet: a fast line's of 2 seconds
 
 
-def open_serial(port: str, baudrate: int) -> TtyPort | TcpPort | PumpedPort:
+def open_serial(name: PortName, baudrate: int) -> TtyPort | TcpPort | PumpedPort:
     """Open a path (`/dev/ttyUSB0`, a pty) or a URL (`socket://host:port`, `rfc2217://host:port`), 8N1.
 
     `baudrate` in bit/s; socket:// has none. Raises PortError.
     """
-    if port.startswith("socket://"):
-        return TcpPort(port)
+    port = name.text
+    if name.scheme == "socket":
+        return TcpPort(name)
     if baudrate <= 0:
         raise PortError(f"{port}: baudrate {baudrate} must be above 0")
-    if port.startswith("/"):
+    if name.path:
         _refuse_terminal(port)
     try:
         # Any: the stub promises serial.Serial whatever the URL.
@@ -121,20 +122,15 @@ class TcpPort:
     and sleeps in close().
     """
 
-    def __init__(self, url: str) -> None:
-        self.description = url
+    def __init__(self, name: PortName) -> None:
+        self.description = url = name.text
         self.serial_number: str | None = None
         self.product: str | None = None
         self.failure: BridgeError | None = None  # never set: read() tells
-        try:
-            parts = urlsplit(url)
-            host, number = parts.hostname, parts.port
-        except ValueError:
-            host = number = None
-        if not host or not number:
+        if name.address is None:
             raise PortError(f"{url}: not of the form socket://HOST:PORT, PORT being 1 to 65535")
         try:
-            self._socket = socket.create_connection((host, number), _CONNECT_LIMIT_S)
+            self._socket = socket.create_connection(name.address, _CONNECT_LIMIT_S)
         except OSError as error:
             raise PortError(_explain_network(url, error)) from error
         _notice_dead_peers(self._socket)
@@ -232,7 +228,7 @@ def _notice_dead_peers(connection: socket.socket) -> None:
 def _explain(port: str, baudrate: int, error: Exception) -> str:
     """What is wrong and what to do. pyserial raises while it handles the error that tells more."""
     cause = error.__context__ if isinstance(error.__context__, OSError | termios.error) else error
-    if "://" in port:
+    if PortName(port).scheme:
         return _explain_network(port, cause)
     code = cause.errno if isinstance(cause, OSError) else cause.args[0] if cause.args else None
     match code:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from bridged.ports import sysfs
+from bridged.ports.names import PortName
 
 SETTLED_S: Final = 1.0  # after the start, which a look through /proc would delay
 PAUSE_S: Final = 10.0  # between two looks: with many processes one takes some milliseconds
@@ -32,7 +33,7 @@ class Sharing:
 
     def opened(self, port: str, now: float) -> None:
         """The port is open: a look follows. `port`: its path; a URL has no other users here."""
-        self._port = port if port.startswith("/") else ""
+        self._port = PortName(port).path
         if self._port:
             self.next_at = max(now + SETTLED_S, self._looked_at + PAUSE_S)
 

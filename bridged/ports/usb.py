@@ -10,7 +10,6 @@ import ctypes
 import errno
 import os
 import pwd
-import re
 import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -28,9 +27,10 @@ from bridged.text import printable
 if TYPE_CHECKING:
     from array import array
 
+    from bridged.ports.names import PortName
+
 _DEV: Final = Path("/dev")
 _LIBUSB: Final = "libusb-1.0.so.0"
-_URL: Final = re.compile(r"usb://([0-9A-Fa-f]{1,4}):([0-9A-Fa-f]{1,4})(?:/(.+))?")
 _RULES: Final = "/etc/udev/rules.d/70-can-bridge.rules"
 
 _POLL_INTERVAL_MS: Final = round(POLL_INTERVAL_S * 1000)
@@ -51,18 +51,18 @@ _STATUS_BYTES: Final = 2  # modem and line status, in front of each packet
 _PACKETS: Final = 64  # in one transfer at most
 
 
-def open_usb(url: str) -> UsbPort:
+def open_usb(name: PortName) -> UsbPort:
     """Open `usb://VID:PID[/SERIAL]`, VID and PID hexadecimal as lsusb shows them. Raises PortError."""
-    parts = _URL.fullmatch(url)
-    if parts is None:
+    url = name.text
+    if name.usb_id is None:
         raise PortError(f"{url}: not of the form usb://VID:PID or usb://VID:PID/SERIAL, as usb://0403:6001")
-    vendor, product = (int(part, 16) for part in parts.group(1, 2))
+    vendor, product = name.usb_id
     backend = _load_libusb(url)
     try:
         alike = list(usb.core.find(find_all=True, backend=backend, idVendor=vendor, idProduct=product))
     except USBError as error:
         raise PortError(f"{url}: cannot list USB devices: {error}") from error
-    device, serial_number = _choose(url, alike, parts.group(3))
+    device, serial_number = _choose(url, alike, name.serial_number)
     try:
         chip = _Chip(url, device)
     except USBError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import re
 import socket
 import struct
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Final
 
 from bridged.errors import PortError
 from bridged.ports import sysfs
-from bridged.ports.names import is_numbered_terminal
+from bridged.ports.names import PortName
 
 _SYS: Final = Path("/sys")
 _DEV: Final = Path("/dev")
@@ -29,8 +28,6 @@ _GROUPS: Final = (1, 2)
 _UDEV_PREFIX: Final = b"libudev\0"
 _UDEV_OFFSET: Final = struct.Struct("=16xI")  # where the properties begin (systemd, device-monitor.c)
 _EVENT_SIZE: Final = 16_384
-
-_USB_URL: Final = re.compile(r"usb://([0-9A-Fa-f]{1,4}):([0-9A-Fa-f]{1,4})(?:/(.+))?")
 
 
 class Watch:
@@ -48,12 +45,11 @@ class Watch:
         `events` is non-blocking and stands for the kernel's socket of device events.
         """
         self._port = port
+        self._name = PortName(port)
         self._usb_serial_number = usb_serial_number
-        self._usb = _USB_URL.fullmatch(port)
-        self._is_numbered = is_numbered_terminal(port)
         self._terminal: tuple[int, int] | None = None  # the numbered one that was opened
         self._socket = events
-        if events is None and (self._usb or "://" not in port):
+        if events is None and (self._name.usb_id or self._name.path):
             with contextlib.suppress(OSError):
                 self._socket = socket.socket(
                     socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, _NETLINK_KOBJECT_UEVENT
@@ -82,9 +78,9 @@ class Watch:
 
     def is_there(self) -> bool:
         """Whether there is something to open. True where one cannot know."""
-        if self._usb:
-            return self._has_usb_device()
-        if "://" in self._port:
+        if self._name.usb_id:
+            return self._has_usb_device(*self._name.usb_id)
+        if not self._name.path:
             return True
         if self._is_stranger():
             return False
@@ -98,7 +94,7 @@ class Watch:
 
     def path(self) -> str:
         """What to open: the port, or the tty that has the serial number if what the port means has not."""
-        if self._usb_serial_number is None or "://" in self._port:
+        if self._usb_serial_number is None or not self._name.path:
             return self._port
         ttys = [
             tty.name
@@ -111,7 +107,7 @@ class Watch:
 
     def opened(self, fd: int) -> None:
         """The port was opened as `fd`: a numbered terminal is known by it from now on."""
-        if self._is_numbered and self._terminal is None:
+        if self._name.is_numbered_terminal and self._terminal is None:
             self._terminal = _identity(os.fstat(fd))
 
     def refuse_stranger(self) -> None:
@@ -136,24 +132,23 @@ class Watch:
     def _is_ours(self, event: dict[str, str]) -> bool:
         if event.get("ACTION") != "add":
             return False
-        if self._usb:
-            vendor, product = (int(text, 16) for text in self._usb.group(1, 2))
+        if self._name.usb_id:
+            vendor, product = self._name.usb_id
             wanted = f"{vendor:x}/{product:x}/"  # PRODUCT=403/6001/600, the last is the version
             return event.get("DEVTYPE") == "usb_device" and event.get("PRODUCT", "").startswith(wanted)
         name = Path(event.get("DEVNAME", "")).name  # ttyUSB0 from the kernel, /dev/ttyUSB0 from udev
         return event.get("SUBSYSTEM") == "tty" and name == Path(self.path()).resolve().name
 
-    def _has_usb_device(self) -> bool:
-        assert self._usb
+    def _has_usb_device(self, vendor: int, product: int) -> bool:
         devices = _SYS / "bus/usb/devices"
         if not devices.exists():
             return True
-        vendor, product = (f"{int(text, 16):04x}" for text in self._usb.group(1, 2))
+        wanted = (f"{vendor:04x}", f"{product:04x}")
         for device in devices.iterdir():
             with contextlib.suppress(OSError):  # an interface, or just unplugged
-                if (_read(device / "idVendor"), _read(device / "idProduct")) != (vendor, product):
+                if (_read(device / "idVendor"), _read(device / "idProduct")) != wanted:
                     continue
-                if self._usb[3] in {None, sysfs.serial_number(device)}:
+                if self._name.serial_number in {None, sysfs.serial_number(device)}:
                     return True
         return False
 

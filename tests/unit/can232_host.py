@@ -5,9 +5,8 @@ from typing import Any, Protocol
 
 from bridged import _relay
 from bridged.adapters.base import Answer, Exchange, Reply, Steps
-from bridged.adapters.can232 import Can232
+from bridged.adapters.can232 import Can232, Can232Config
 from bridged.can import BitTiming
-from bridged.config import Can232Config
 from bridged.errors import AdapterError
 from bridged.settings import ChannelConfig
 

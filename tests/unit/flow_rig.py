@@ -13,8 +13,8 @@ from books import check_books
 from bridged import _relay
 from bridged.adapters.base import Answer, Reply, Steps
 from bridged.adapters.usb2can import Usb2can as Adapter
+from bridged.adapters.usb2can import Usb2canConfig
 from bridged.can import BitTiming
-from bridged.config import Usb2canConfig
 from bridged.errors import AdapterError
 from bridged.settings import ChannelConfig
 from bridged.simulators.sja1000 import Frame

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridged import can
+from bridged.adapters.can232 import BITRATE_COMMANDS, bitrate_command
 from bridged.simulators import sja1000
 
 with warnings.catch_warnings(action="ignore"):  # python-can 4.1 on Python 3.11
@@ -152,7 +153,7 @@ def test_registers_mean_what_the_data_sheet_says(btr0: int, btr1: int) -> None:
     ],
 )
 def test_can232_command(timing: can.BitTiming, command: bytes, description: str) -> None:
-    assert timing.can232_command() == command
+    assert bitrate_command(timing) == command
     assert timing.description == description
 
 
@@ -179,7 +180,7 @@ def test_registers_of_a_standard_bitrate(bitrate: int, registers: tuple[int, int
 
 
 def test_every_standard_bitrate_has_registers() -> None:
-    assert can._STANDARD_REGISTERS.keys() == can.CAN232_STANDARD_BITRATES.keys()
+    assert can.STANDARD_REGISTERS.keys() == BITRATE_COMMANDS.keys()
 
 
 @pytest.mark.parametrize("registers", [(0x03, 0x1C), (0x43, 0x1C), (0, 0x14)])

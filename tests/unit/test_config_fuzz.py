@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridged import config
+from bridged.adapters.usb2can import Usb2canConfig
 from bridged.config import load
 from bridged.errors import ConfigError
 from bridged.yaml_source import key_names
@@ -97,7 +98,7 @@ def test_any_damage(fuzzed: Path, text: str, cuts: list[tuple[int, int, str]]) -
 SCALARS = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20) | st.sampled_from(PIECES)
 )
-KEYS = st.sampled_from([key for schema in config._SECTIONS.values() for key in key_names(schema)])
+KEYS = st.sampled_from([key for schema in config._schemas().values() for key in key_names(schema)])
 SECTION = st.dictionaries(KEYS | st.text(max_size=5), SCALARS | st.lists(SCALARS, max_size=3), max_size=6)
 
 
@@ -135,7 +136,7 @@ def test_any_adapter(fuzzed: Path, adapter: dict[str, object], transmit: dict[st
         return
     assert loaded.adapter.type == adapter["type"]
     assert 1 <= loaded.transmit.window <= 32
-    if isinstance(loaded.adapter, config.Usb2canConfig):
+    if isinstance(loaded.adapter, Usb2canConfig):
         assert "baudrate" not in adapter
         assert 0 <= loaded.adapter.ready_limit < loaded.adapter.critical_limit <= 18
         serial_number = loaded.adapter.serial_number

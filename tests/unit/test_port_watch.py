@@ -177,7 +177,7 @@ def test_the_same_device_at_another_path(machine: Machine) -> None:
     ("url", "there"),
     [
         ("usb://0403:6001", True),
-        ("usb://403:6001/A1", True),
+        ("usb://0403:6001/A1", True),
         ("usb://0403:6001/B2", False),
         ("usb://0403:6015", False),
         ("usb://0404:6001", False),

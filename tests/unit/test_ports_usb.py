@@ -297,15 +297,14 @@ class TestChoice:
             open_port(f"{URL}/B2", 57600)
 
     @pytest.mark.parametrize(
-        "bad", ["usb://", "usb://0403", "usb://0403:", "usb://0403:60011", "usb://ftdi:6001", f"{URL}/"]
+        "bad", ["usb://", "usb://0403", "usb://0403:", "usb://403:6001", "usb://ftdi:6001", f"{URL}/"]
     )
     def test_malformed(self, bad: str) -> None:
         with pytest.raises(PortError, match="not of the form usb://VID:PID"):
             open_port(bad, 57600)
 
     @pytest.mark.usefixtures("chip")
-    def test_case_and_zeros_do_not_matter(self) -> None:
-        open_port("usb://403:6001", 57600).close()
+    def test_case_does_not_matter(self) -> None:
         with pytest.raises(PortError, match="no such USB device"):
             open_port("usb://ABCD:ef01", 57600)
 

@@ -7,9 +7,8 @@ import pytest
 
 from bridged import _relay
 from bridged.adapters.base import Answer, Reply, Steps
-from bridged.adapters.usb2can import Usb2can
+from bridged.adapters.usb2can import Usb2can, Usb2canConfig
 from bridged.can import BitTiming
-from bridged.config import Usb2canConfig
 from bridged.errors import AdapterError
 from bridged.settings import ChannelConfig
 from bridged.simulators.sja1000 import MOD
