@@ -95,15 +95,23 @@ class KeptPort:
         self._unread, self._tries = other._unread, other._tries
 
     def close(self) -> None:
-        """Idempotent."""
+        """Idempotent. Nobody can give the device the rest after this, so the user is told what to do."""
         if self._port is not None:
-            self._port.close()
-            self._port = None
+            self._tell(
+                "the adapter may not have read its last frames whole (counted as unanswered): unplug it and plug "
+                "it in again before it is used anew, or it may send one of them with other bytes in it"
+            )
+            self._drop()
 
     def _give_up(self, why: str) -> None:
         self._tell(f"it is not known whether the adapter sent its last frames (counted as unanswered): {why}")
-        self.close()
+        self._drop()
         self.runs()
+
+    def _drop(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
 
     def _tell(self, text: str) -> None:
         times = self._told.tell(text, time.monotonic())

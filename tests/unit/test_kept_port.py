@@ -186,12 +186,25 @@ def test_a_port_in_which_nothing_waits_is_opened_anew_in_the_end(caplog: pytest.
         bridge.goes_on()
 
 
-def test_another_bridge_takes_it_over() -> None:
+def test_the_end_of_the_bridge_tells_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
+    with rig_with() as rig, caplog.at_level(logging.WARNING):
+        bridge = Bridge(rig, 20)
+        bridge.kept.close()
+        assert "plug it in again before it is used anew" in caplog.messages[-1]
+        assert bridge.port.fd == -1
+        told = len(caplog.messages)
+        bridge.kept.close()
+        assert len(caplog.messages) == told
+
+
+def test_another_bridge_takes_it_over(caplog: pytest.LogCaptureFixture) -> None:
     with rig_with() as rig:
         bridge = Bridge(rig, 20)
         other = KeptPort(rig.relay)
         other.adopt(bridge.kept)
+        told = len(caplog.messages)
         bridge.kept.close()
+        assert len(caplog.messages) == told  # nothing is lost
         bridge.kept = other
         reads_on(rig)
         assert bridge.tries()
