@@ -66,6 +66,7 @@ class Bench:
         self.open_port: Callable[[str, int], Any] = open_port
         self.open_interface: Callable[..., Any] = lambda *_args, **_options: self.bus
         self.watch: Watch | None = None
+        self._bridges: list[Bridge] = []
         self._simulator: Simulator | None = None
         self._thread: threading.Thread | None = None
 
@@ -99,13 +100,15 @@ class Bench:
         return self.bridge_of(path)
 
     def bridge_of(self, path: Path) -> Bridge:
-        return Bridge(
+        bridge = Bridge(
             load(path),
             FileMemory(self.folder / "state"),
             open_port=self._open_port,
             open_interface=self.open_interface,
             watch=self.watch,
         )
+        self._bridges.append(bridge)
+        return bridge
 
     def _open_port(self, port: str, baudrate: int) -> Any:
         """As `open_port` says at that time."""
@@ -119,6 +122,10 @@ class Bench:
         return kernel, ours
 
     def close(self) -> None:
+        for bridge in self._bridges:  # of a test that failed: its relay would keep the interpreter from ending
+            if not bridge.finished:
+                bridge.abort()
+                bridge.close()
         self.pull_out()
         self.bus.close()
         self.bus.far.close()

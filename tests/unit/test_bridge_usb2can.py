@@ -35,7 +35,6 @@ class Usb2canBench(Bench):
         self.link = folder / "usb2can"
         self.on_frame: Callable[[Usb2can], None] = lambda _device: None
         self._buses = [self.bus]
-        self._bridges: list[Bridge] = []
         self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._far.settimeout(LIMIT_S)
 
@@ -66,9 +65,7 @@ class Usb2canBench(Bench):
         text = f"adapter: {{type: usb2can, port: {self.link}{options}}}\nchannel: {{{channel}}}\n"
         text += "bus: {channel: vcan0}\n" + (f"transmit: {transmit}\n" if transmit else "")
         path.write_text(text)
-        bridge = self.bridge_of(path)
-        self._bridges.append(bridge)
-        return bridge
+        return self.bridge_of(path)
 
     def send(self, *frames: Frame) -> None:
         for frame in frames:
