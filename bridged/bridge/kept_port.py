@@ -98,8 +98,8 @@ class KeptPort:
         """Idempotent. Nobody can give the device the rest after this, so the user is told what to do."""
         if self._port is not None:
             self._tell(
-                "the adapter may not have read its last frames whole (counted as unanswered): unplug it and plug "
-                "it in again before it is used anew, or it may send one of them with other bytes in it"
+                "the adapter may not have read its last frames whole (counted as unanswered): unplug it and "
+                "plug it in again before it is used anew, or it may send one of them with other bytes in it"
             )
             self._drop()
 

@@ -67,7 +67,8 @@ class HealthPolling:
         self._awaited = 0  # those still to come
         self._unknown = 0  # looks one after the other without an answer
         self.description = ""  # what the adapter said last
-        self.full_at = -math.inf  # when it said last that its transmit buffer was full
+        self._seen_at = 0.0
+        self._full_at = -math.inf  # when it said last that its transmit buffer was full
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
         self._warned = LogLimiter(LOG_INTERVAL_S)
@@ -148,6 +149,14 @@ class HealthPolling:
         """Whether bytes without meaning came since the last look, and since this was asked last."""
         return self._is_news(self._tally().skipped_bytes)
 
+    def was_full(self, seconds: float) -> bool:
+        """Whether the adapter's transmit buffer was full in so many seconds before it was heard last.
+
+        Not before now: a bridge that gets no processor time hears late. And two looks are allowed for: the
+        adapter says so only if it has refused a frame since the look before.
+        """
+        return self._seen_at - self._full_at <= seconds + 2 * self._interval_s
+
     def _is_news(self, noise: int) -> bool:
         before, self._noise_seen = self._noise_seen, noise
         return noise != before
@@ -218,10 +227,11 @@ class HealthPolling:
 
     def _take(self, seen: Observation) -> Finding:
         self.description = seen.description
+        self._seen_at = time.monotonic()
         if seen.happened is not Happened.NOTHING and seen.happened & Happened.TX_FULL:
-            self.full_at = time.monotonic()
+            self._full_at = self._seen_at
         before = self.health.state
-        frames = tuple(self.health.observe(seen, time.monotonic()))
+        frames = tuple(self.health.observe(seen, self._seen_at))
         state = self.health.state
         if state is not None and state != before and (before is not None or state != BusState.ERROR_ACTIVE):
             self._log_state(state, seen.description)

@@ -79,7 +79,7 @@ class Recovery:
             why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
             reason = f"{cause}, {frames} are in its buffer ({why}){ANEW}"
             return Verdict(Event.SILENT, reason, pause_s)
-        if now - polling.full_at <= limit_s:  # it cannot tell bus-off
+        if polling.was_full(limit_s):  # it cannot tell bus-off
             return self.off(
                 f"{cause} (does another node acknowledge them?), its status: {polling.description}"
             )

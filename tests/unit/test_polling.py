@@ -2,11 +2,13 @@
 
 import time
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import pytest
 
 from bridged import _relay
-from bridged.adapters.base import UNKNOWN, Answer, Exchange, Observation, Reply
+from bridged.adapters.base import UNKNOWN, Answer, Exchange, Happened, Observation, Reply
+from bridged.bridge import polling as polling_module
 from bridged.bridge.health import Finding
 from bridged.bridge.polling import UNKNOWN_LIMIT, HealthPolling
 from bridged.can import BusState, error_frame, state_of
@@ -205,3 +207,25 @@ def test_overruns_are_told_to_the_bus() -> None:
     bench.answer()
     (frame,) = bench.told
     assert frame[9] == 0x01  # CRTL_RX_OVERFLOW
+
+
+def test_a_full_buffer_is_what_the_adapter_said_last_however_late_the_bridge_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(polling_module, "time", SimpleNamespace(monotonic=lambda: now))
+    bench = Bench()
+    assert not bench.polling.was_full(0.5)
+    for flags, later, full in [
+        (Happened.TX_FULL, 0.0, True),
+        (Happened.NOTHING, 0.9, True),
+        (Happened.NOTHING, 0.2, False),
+    ]:
+        now += later
+        bench.adapter.seen = Observation("flags", happened=flags)
+        while bench.asked:
+            bench.answer()
+        bench.polling.on_timer(1e9)
+        now += 5.0
+        assert bench.polling.was_full(0.5) == full
+        now -= 5.0
