@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from books import check_books
+from simulating import until
 
 from bridged import _relay
 from bridged.bridge.bridge import Bridge
@@ -122,7 +123,7 @@ class Bench:
         return kernel, ours
 
     def close(self) -> None:
-        for bridge in self._bridges:  # of a test that failed: its relay would keep the interpreter from ending
+        for bridge in self._bridges:  # of a test that failed: its relay would keep pytest from ending
             if not bridge.finished:
                 bridge.abort()
                 bridge.close()
@@ -233,7 +234,7 @@ def test_a_hundred_starts_write_the_eeprom_once(bench: Bench) -> None:
     bench.plug_in(Can232(time.monotonic()))
     for _ in range(100):
         stopped(started(bench.bridge("bitrate: 125000, acceptance: {code: 0x6000, mask: 0x1FF0}")))
-        assert bench.device.state is not Channel.OPEN
+        until(lambda: bench.device.state is not Channel.OPEN)  # on a busy machine it may be late
     assert bench.device.eeprom.writes == 1
     assert bench.frames == []
 
