@@ -19,7 +19,9 @@
 #include <termios.h>
 #include <unistd.h>
 
-#include "../../bridged/relay/relay.h" /* batch sizes */
+/* The batch sizes. */
+#include "../../bridged/relay/intake.h"
+#include "../../bridged/relay/receive.h"
 
 enum { LINE = 22, ANSWER = 2, PORT = 1, BUS = 2 };
 
@@ -27,12 +29,12 @@ static const char LINE_TEXT[LINE + 1] = "t12381122334455667788\r";
 
 static char in[PORT_BUFFER], out[WINDOW_MAX * LINE];
 static struct can_frame rx[RX_BATCH];
-static struct iovec rx_iov[RX_BATCH], bus_iov[BUS_BATCH];
-static struct mmsghdr rx_msg[RX_BATCH], bus_msg[BUS_BATCH];
+static struct iovec rx_iov[RX_BATCH], bus_iov[INTAKE_BATCH];
+static struct mmsghdr rx_msg[RX_BATCH], bus_msg[INTAKE_BATCH];
 static struct {
     struct canfd_frame frame;
     char control[128];
-} bus_message[BUS_BATCH];
+} bus_message[INTAKE_BATCH];
 
 static void die(const char *what)
 {
@@ -76,7 +78,7 @@ static void init(void)
         rx_iov[i] = (struct iovec){&rx[i], sizeof rx[i]};
         rx_msg[i].msg_hdr = (struct msghdr){.msg_iov = &rx_iov[i], .msg_iovlen = 1};
     }
-    for (int i = 0; i < BUS_BATCH; i++) {
+    for (int i = 0; i < INTAKE_BATCH; i++) {
         bus_iov[i] = (struct iovec){&bus_message[i].frame, sizeof bus_message[i].frame};
         bus_msg[i].msg_hdr = (struct msghdr){
             .msg_iov = &bus_iov[i], .msg_iovlen = 1, .msg_control = bus_message[i].control};
@@ -129,9 +131,9 @@ int main(int argc, char **argv)
             }
         }
         if (ready & BUS) {
-            for (int i = 0; i < BUS_BATCH; i++)
+            for (int i = 0; i < INTAKE_BATCH; i++)
                 bus_msg[i].msg_hdr.msg_controllen = sizeof bus_message[i].control;
-            int n = recvmmsg(bus, bus_msg, BUS_BATCH, MSG_DONTWAIT, NULL);
+            int n = recvmmsg(bus, bus_msg, INTAKE_BATCH, MSG_DONTWAIT, NULL);
             waiting += n > 0 ? n : 0;
         }
         int go = waiting < window - inflight ? waiting : window - inflight;

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Builds and runs the C unit tests with every compiler there is, under AddressSanitizer and UBSan.
-# run.sh         the tests; also that the codecs compile without a warning at -O2, and that the bench compiles
+# run.sh         the tests; also that the codecs compile without a warning at -O2, and that the benches compile
 # run.sh bench   the codecs' throughput instead
 set -eu
 cd "$(dirname "$0")/../.."
@@ -34,6 +34,8 @@ run_test() {
 bench() {
     "$cc" -std=c11 -O2 -Wall -Wextra -Werror "$native/bench_codec.c" "$relay"/codec_*.c \
         -o "$build/bench_codec-$cc"
+    "$cc" -std=c11 -O2 -Wall -Wextra -Werror tests/bench/floor.c -o "$build/floor-$cc"
+    "$cc" -std=c11 -O2 -Wall -Wextra -Werror tests/bench/load*.c -o "$build/load-$cc"
 }
 
 # The relay's files that know nothing of Python; a test that includes relay.c takes the parts only.
