@@ -114,6 +114,7 @@ def test_both_ways_at_once_and_with_a_window_of_two(rig: Rig) -> None:
     bridge.stop_cleanly()
 
 
+@pytest.mark.parametrize("count", FRAMES)
 def test_slcanpty_as_the_adapter(rig: Rig, count: int) -> None:
     near, far = rig.vcan(), rig.vcan()
     _, port = rig.slcanpty(far)
