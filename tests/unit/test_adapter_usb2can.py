@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator
 
 import pytest
-from usb2can_host import (
+from benches.usb2can_host import (
     Host,
     Parrot,
     adapter_for,
@@ -14,7 +14,7 @@ from usb2can_host import (
     settings,
     started,
 )
-from usb2can_words import LOOPBACK, OPEN, SETUP, WRITTEN, ask, opened
+from benches.usb2can_words import LOOPBACK, OPEN, SETUP, WRITTEN, ask, opened
 
 from bridged import _relay
 from bridged.adapters.base import Answer, Happened, Observation, Reply

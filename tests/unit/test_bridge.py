@@ -1,163 +1,27 @@
 """Bridge, relay and adapter against a simulated CAN232 on a real pty; only the CAN side is a socketpair."""
 
-import contextlib
 import errno
 import logging
 import os
 import re
 import select
 import socket
-import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from books import check_books
-from simulating import until
+from benches.bridge import FRAME, Bench, PairPort, run_until, started, stopped
+from benches.simulating import until
 
 from bridged import _relay
-from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Action, Event, State, Verdict
-from bridged.config import load
-from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.service import serve
-from bridged.ports import open_port
-from bridged.ports.watch import Watch
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232 import State as Channel
-from bridged.simulators.serve import Fault, Simulator
-from bridged.simulators.sja1000 import Frame
-
-FRAME = struct.Struct("=IB3x8s")
-LIMIT_S = 30.0
-
-
-class PairBus:
-    """A bus like socketcan's, whose other end is `far`."""
-
-    warning = ""
-    failure = None
-
-    def __init__(self) -> None:
-        self._near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._near.setblocking(False)
-        self.far.settimeout(LIMIT_S)
-        self.fd = self._near.fileno()
-        self.description = "pair"
-
-    def dropped(self) -> dict[str, int]:
-        return {}
-
-    def close(self) -> None:
-        self._near.close()
-
-
-class Bench:
-    """A simulated adapter, a bridge on it, and the far end of its bus. The bridge runs in run_until()."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.link = folder / "can232"
-        self.frames: list[Frame] = []  # that the adapter put on its CAN bus
-        self.bus = PairBus()
-        self.open_port: Callable[[str, int], Any] = open_port
-        self.open_interface: Callable[..., Any] = lambda *_args, **_options: self.bus
-        self.watch: Watch | None = None
-        self._bridges: list[Bridge] = []
-        self._simulator: Simulator | None = None
-        self._thread: threading.Thread | None = None
-
-    def plug_in(self, device: Can232, *, faults: tuple[Fault, ...] = (), traffic_fps: float = 0.0) -> None:
-        self.device = device
-        self._simulator = Simulator(
-            device, link=self.link, on_frame=self.frames.append, faults=faults, traffic_fps=traffic_fps
-        )
-        self._thread = threading.Thread(target=self._simulator.run)
-        self._thread.start()
-        while not self.link.exists():
-            os.sched_yield()
-
-    def pull_out(self) -> None:
-        if self._simulator and self._thread:
-            self._simulator.stop()
-            self._thread.join()
-            self._simulator = None
-
-    def bridge(
-        self, channel: str = "bitrate: 125000", transmit: str = "{}", more: str = "", **adapter: object
-    ) -> Bridge:
-        path = self.folder / "bench.yaml"
-        options = "".join(f", {key}: {value}" for key, value in adapter.items())
-        path.write_text(
-            f"adapter: {{type: can232, port: {self.link}, baudrate: 115200{options}}}\n"
-            f"channel: {{{channel}}}\nbus: {{channel: vcan0}}\n{more}\ntransmit: {transmit}\n".replace(
-                "transmit: {}\n", ""
-            )
-        )
-        return self.bridge_of(path)
-
-    def bridge_of(self, path: Path) -> Bridge:
-        bridge = Bridge(
-            load(path),
-            FileMemory(self.folder / "state"),
-            open_port=self._open_port,
-            open_interface=self.open_interface,
-            watch=self.watch,
-        )
-        self._bridges.append(bridge)
-        return bridge
-
-    def _open_port(self, port: str, baudrate: int) -> Any:
-        """As `open_port` says at that time."""
-        return self.open_port(port, baudrate)
-
-    def watch_events(self) -> tuple[socket.socket, socket.socket]:
-        """Where the kernel would tell the next bridge of devices, and where that listens."""
-        kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        ours.setblocking(False)
-        self.watch = Watch(str(self.link), events=ours)
-        return kernel, ours
-
-    def close(self) -> None:
-        for bridge in self._bridges:  # of a test that failed: its relay would keep pytest from ending
-            if not bridge.finished:
-                bridge.abort()
-                bridge.close()
-        self.pull_out()
-        self.bus.close()
-        self.bus.far.close()
-
-
-def run_until(bridge: Bridge, condition: Callable[[], object]) -> None:
-    """What service.serve does, until something is so."""
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        timer = bridge.next_timer()
-        wait = 0.05 if timer is None else min(0.05, max(0.0, timer - time.monotonic()))
-        if select.select(bridge.filenos(), (), (), wait)[0]:
-            bridge.on_readable()
-        bridge.on_timer(time.monotonic())
-        assert time.monotonic() < end, f"still {bridge.state}: {bridge.reason}"
-
-
-def started(bridge: Bridge, state: State = State.RUNNING) -> Bridge:
-    bridge.start()
-    run_until(bridge, lambda: bridge.state is state)
-    return bridge
-
-
-def stopped(bridge: Bridge) -> dict[str, Any]:
-    """Stops it; its last snapshot, with the books checked."""
-    bridge.stop()
-    run_until(bridge, lambda: bridge.finished)
-    bridge.close()
-    status = bridge.snapshot()
-    check_books(status["counters"], status["queued"])
-    return status
+from bridged.simulators.serve import Fault
 
 
 def type_in(device: Can232, *commands: bytes) -> None:
@@ -166,13 +30,6 @@ def type_in(device: Can232, *commands: bytes) -> None:
         device.host_writes(time.monotonic(), command)
         device.advance(time.monotonic())
     device.take_output(time.monotonic())
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    b = Bench(tmp_path)
-    with contextlib.closing(b):
-        yield b
 
 
 def test_what_an_action_leads_to_waits_until_the_actions_before_it_are_done(
@@ -478,24 +335,6 @@ def test_noise_is_named_where_it_may_be_the_cause(bench: Bench) -> None:
     run_until(bridge, lambda: bridge.state is State.CLOSING)
     assert "; there is noise on the line" in bridge.reason
     stopped(bridge)
-
-
-class PairPort:
-    """A port whose device is a thread of the test."""
-
-    description = "pair"
-    failure = None
-    serial_number: str | None = None
-    product: str | None = None
-
-    def __init__(self, kind: int = socket.SOCK_STREAM) -> None:
-        self._near, self.far = socket.socketpair(socket.AF_UNIX, kind)
-        self._near.setblocking(False)
-        self.far.settimeout(LIMIT_S)
-        self.fd = self._near.fileno()
-
-    def close(self) -> None:
-        self._near.close()
 
 
 def lines(port: PairPort) -> Iterator[bytes]:

@@ -5,11 +5,9 @@ import os
 import pty
 import termios
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from test_bridge import Bench, run_until, started, stopped
+from benches.bridge import Bench, run_until, started, stopped
 
 from bridged.bridge import bridge as bridge_module
 from bridged.bridge.bridge import Bridge
@@ -17,12 +15,6 @@ from bridged.bridge.lifecycle import State
 from bridged.errors import PortError
 from bridged.ports import Port, open_port
 from bridged.simulators.can232 import Can232
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path)) as b:
-        yield b
 
 
 @pytest.mark.parametrize("failures", [1, 5])

@@ -4,13 +4,11 @@ import contextlib
 import itertools
 import socket
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
+from benches.bridge import FRAME, Bench, Usb2canBench, run_until, started, stopped
 from books import check_books
-from test_bridge import FRAME, Bench, run_until, started, stopped
-from test_bridge_usb2can import Usb2canBench
 
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
@@ -21,11 +19,10 @@ INTERVAL_S = 0.01
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path)) as made:
-        receive_stamped(made.bus._near)
-        made.plug_in(Can232(time.monotonic()))
-        yield made
+def bench(bench: Bench) -> Bench:
+    receive_stamped(bench.bus._near)
+    bench.plug_in(Can232(time.monotonic()))
+    return bench
 
 
 class Traffic:
@@ -61,10 +58,9 @@ def after(seconds: float) -> Callable[[], bool]:
 
 
 @pytest.fixture
-def usb2can(tmp_path: Path) -> Iterator[Usb2canBench]:
-    with contextlib.closing(Usb2canBench(tmp_path)) as made:
-        made.device_plugged_in()
-        yield made
+def usb2can(usb2can_bench: Usb2canBench) -> Usb2canBench:
+    usb2can_bench.device_plugged_in()
+    return usb2can_bench
 
 
 @pytest.mark.parametrize("adapter", ["can232", "usb2can"])

@@ -1,20 +1,10 @@
 """The end of a bridge on a CAN232."""
 
-import contextlib
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
-import pytest
-from test_bridge import FRAME, Bench, run_until, started, stopped
+from benches.bridge import FRAME, Bench, run_until, started, stopped
 
 from bridged.simulators.can232 import TRANSMIT_FIFO, Can232
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path)) as b:
-        yield b
 
 
 def test_what_it_has_taken_is_on_the_bus_before_it_is_closed(bench: Bench) -> None:

@@ -5,93 +5,28 @@ import itertools
 import logging
 import random
 import select
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
-from test_bridge import LIMIT_S, Bench, PairBus, PairPort, run_until, started, stopped
+from benches.bridge import LIMIT_S, STOP_GRACE_S, PairPort, Usb2canBench, run_until, started, stopped
 
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
-from bridged.simulators.ends import pack, unpack
-from bridged.simulators.serve import Simulator, mixed_frames
+from bridged.simulators.ends import unpack
+from bridged.simulators.serve import mixed_frames
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.usb2can import State as Mode
 from bridged.simulators.usb2can import Usb2can
 
-STOP_GRACE_S = 5.0  # for what is on its way when the device says stop: this machine may be slow
 SLOW = "bitrate: 10000"  # a frame takes 5 ms and more
 
 
-class Usb2canBench(Bench):
-    """A simulated USB2CAN; `on_frame` is called in its thread for each frame that it puts on its bus."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self.link = folder / "usb2can"
-        self.on_frame: Callable[[Usb2can], None] = lambda _device: None
-        self._buses = [self.bus]
-        self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._far.settimeout(LIMIT_S)
-
-    def device_plugged_in(self, traffic_fps: float = 0.0, **options: Any) -> Usb2can:
-        device = Usb2can(time.monotonic(), stop_grace_s=STOP_GRACE_S, **options)
-
-        def on_frame(frame: Frame) -> None:
-            self.frames.append(frame)
-            self.on_frame(device)
-
-        self._simulator = Simulator(
-            device, link=self.link, bus=self._near, on_frame=on_frame, traffic_fps=traffic_fps
-        )
-        self._thread = threading.Thread(target=self._simulator.run)
-        self._thread.start()
-        end = time.monotonic() + LIMIT_S
-        while not self.link.exists():
-            assert time.monotonic() < end
-            time.sleep(0)
-        return device
-
-    def bridge(self, channel: str = "bitrate: 500000", transmit: str = "", **adapter: object) -> Bridge:
-        """One after the other, each with a bus of its own."""
-        self.bus = PairBus()
-        self._buses.append(self.bus)
-        path = self.folder / "bench.yaml"
-        options = "".join(f", {key}: {value}" for key, value in adapter.items())
-        text = f"adapter: {{type: usb2can, port: {self.link}{options}}}\nchannel: {{{channel}}}\n"
-        text += "bus: {channel: vcan0}\n" + (f"transmit: {transmit}\n" if transmit else "")
-        path.write_text(text)
-        return self.bridge_of(path)
-
-    def send(self, *frames: Frame) -> None:
-        for frame in frames:
-            self.bus.far.send(pack(frame))
-
-    def send_from_its_bus(self, *frames: Frame) -> None:
-        for frame in frames:
-            self._far.send(pack(frame))
-
-    def close(self) -> None:
-        for bridge in self._bridges:
-            if not bridge.finished:
-                bridge.abort()
-        self.pull_out()
-        self._near.close()
-        self._far.close()
-        for bus in self._buses:
-            bus.close()
-            bus.far.close()
-
-
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Usb2canBench]:
-    b = Usb2canBench(tmp_path)
-    with contextlib.closing(b):
-        yield b
+def bench(usb2can_bench: Usb2canBench) -> Usb2canBench:
+    return usb2can_bench
 
 
 def numbered(count: int, length: int = 0) -> list[Frame]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from status_socket import serving, snapshot
+from benches.status_socket import serving, snapshot
 
 from bridged import VERSION, cli
 from bridged.daemon import status

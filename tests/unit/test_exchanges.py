@@ -1,4 +1,4 @@
-"""Procedures of questions and pauses; test_bridge.py has them with an adapter."""
+"""Procedures of questions and pauses; the tests of the bridge have them with an adapter."""
 
 import math
 

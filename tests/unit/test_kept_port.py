@@ -6,7 +6,7 @@ import socket
 from collections.abc import Callable
 
 import pytest
-from flow_rig import Rig, S, numbered, packed, rig_with
+from benches.usb2can_relay import Rig, S, numbered, packed, rig_with
 
 from bridged import _relay
 from bridged.bridge import kept_port

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import can
 import pytest
-from test_bridge import LIMIT_S
+from benches.bridge import LIMIT_S
 
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State

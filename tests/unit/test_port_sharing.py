@@ -1,24 +1,16 @@
 """What the bridge says of other programs that have its adapter's port open."""
 
-import contextlib
 import os
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from test_bridge import Bench, run_until, started, stopped
+from benches.bridge import Bench, run_until, started, stopped
 
 from bridged.ports import sharing, sysfs
 from bridged.ports.sharing import PAUSE_S, SETTLED_S, Sharing
 from bridged.simulators.can232 import Can232
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path)) as b:
-        yield b
 
 
 def test_a_program_without_a_lock_is_named(

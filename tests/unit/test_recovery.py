@@ -4,16 +4,13 @@ import contextlib
 import itertools
 import logging
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import can
 import pytest
-from simulating import until
-from test_bridge import FRAME, Bench, run_until, started, stopped
-from test_bridge_usb2can import Usb2canBench
+from benches.bridge import FRAME, Bench, Usb2canBench, run_until, started, stopped
+from benches.simulating import until
 
 from bridged.adapters.base import Steps
 from bridged.bridge import bridge as bridge_module
@@ -31,15 +28,13 @@ TRANSMIT = f"{{deadline: {DEADLINE_S}}}"
 
 
 @pytest.fixture
-def can232(tmp_path: Path) -> Iterator[Bench]:
-    with contextlib.closing(Bench(tmp_path)) as bench:
-        yield bench
+def can232(bench: Bench) -> Bench:
+    return bench
 
 
 @pytest.fixture
-def usb2can(tmp_path: Path) -> Iterator[Usb2canBench]:
-    with contextlib.closing(Usb2canBench(tmp_path)) as bench:
-        yield bench
+def usb2can(usb2can_bench: Usb2canBench) -> Usb2canBench:
+    return usb2can_bench
 
 
 def send(bench: Bench, can_id: int, count: int = 1) -> None:

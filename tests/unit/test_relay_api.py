@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from test_relay import FRAME, Rig
+from benches.relay import FRAME, Rig
 
 from bridged import _relay
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from test_relay import MS, Rig, can_frame, number_of
+from benches.relay import MS, Rig, can_frame, number_of
 
 from bridged import _relay
 

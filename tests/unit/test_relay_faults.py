@@ -8,7 +8,7 @@ import tty
 from collections.abc import Iterator
 
 import pytest
-from test_relay import MS, Rig, can_frame
+from benches.relay import MS, Rig, can_frame
 
 from bridged import _relay
 

@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from typing import Any
 
 import pytest
-from flow_rig import STOP, US, S, assert_in_order, numbered, packed, rig_with
+from benches.usb2can_relay import STOP, US, S, assert_in_order, numbered, packed, rig_with
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

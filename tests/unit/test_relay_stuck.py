@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator
 
 import pytest
-from test_relay import Rig, can_frame, number_of
+from benches.relay import Rig, can_frame, number_of
 
 from bridged import _relay
 

@@ -6,6 +6,7 @@ import math
 import random
 
 import pytest
+from benches.can232_words import FRAME, ask, opened
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -14,21 +15,7 @@ from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.sja1000 import Frame, accepts, bitrate, frame_bits
 from bridged.simulators.uart import Uart
 
-FRAME = Frame(0x100, False, False, 2, b"\x11\x33")
 CHAR_S = 10 / 115_200
-
-
-def ask(device: Can232, commands: str, now: float = 0.0) -> str:
-    """Write commands and read what comes back, at once (the line has no rate)."""
-    device.host_writes(now, commands.encode())
-    return device.take_output(now).decode()
-
-
-def opened(commands: str = "S6\rO\r", **options: object) -> Can232:
-    device = Can232(**options)  # type: ignore[arg-type]
-    answer = ask(device, commands)
-    assert answer == "\r" * commands.count("\r")
-    return device
 
 
 def receive(device: Can232, *frames: Frame, now: float = 0.0) -> str:

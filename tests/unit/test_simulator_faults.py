@@ -4,13 +4,13 @@ import os
 import random
 
 import pytest
-from simulating import ask as ask_terminal
-from simulating import by_hand, host, running, until
-from test_simulator_can232 import FRAME, opened
-from test_simulator_can232 import ask as ask_can232
-from usb2can_words import GET_MODE, OPEN, check_balance
-from usb2can_words import ask as ask_usb2can
-from usb2can_words import opened as opened_usb2can
+from benches.can232_words import FRAME, opened
+from benches.can232_words import ask as ask_can232
+from benches.simulating import ask as ask_terminal
+from benches.simulating import by_hand, host, running, until
+from benches.usb2can_words import GET_MODE, OPEN, check_balance
+from benches.usb2can_words import ask as ask_usb2can
+from benches.usb2can_words import opened as opened_usb2can
 
 from bridged.simulators.can232 import Can232, State
 from bridged.simulators.faults import CAN232_FAULTS, FAULTS, Fault, begin, end, repeated

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from simulating import TIMEOUT_S, ask, by_hand, count_calls, host, process, read, running, until
+from benches.simulating import TIMEOUT_S, ask, by_hand, count_calls, host, process, read, running, until
 
 from bridged import cli
 from bridged.errors import BusError, PortError

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from simulating import TIMEOUT_S, ask, by_hand, host, process, read, running, until
+from benches.simulating import TIMEOUT_S, ask, by_hand, host, process, read, running, until
 
 from bridged.errors import BusError, PortError
 from bridged.simulators.can232 import Can232

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from usb2can_words import (
+from benches.usb2can_words import (
     BOOT,
     CONFIG,
     FRAME,

@@ -4,9 +4,7 @@ import math
 import sys
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from usb2can_words import (
+from benches.usb2can_words import (
     BOOT,
     CONFIG,
     FRAME,
@@ -32,6 +30,8 @@ from usb2can_words import (
     opened,
     reg,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bridged.simulators.usb2can import Usb2can
 

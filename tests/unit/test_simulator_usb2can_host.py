@@ -3,9 +3,7 @@
 import json
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from usb2can_words import (
+from benches.usb2can_words import (
     BOOT,
     CONFIG,
     FRAME,
@@ -29,6 +27,8 @@ from usb2can_words import (
     opened,
     reg,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bridged.simulators.sja1000 import Frame, bitrate
 from bridged.simulators.usb2can import Usb2can

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from status_socket import listening, serving, snapshot
+from benches.status_socket import listening, serving, snapshot
 
 from bridged.daemon import status
 from bridged.daemon.status import (

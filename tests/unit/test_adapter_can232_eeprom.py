@@ -4,8 +4,8 @@ import logging
 from pathlib import Path
 
 import pytest
-from can232_host import Host, adapter_for
-from clone_parsers import Reference
+from benches.can232_host import Host, adapter_for
+from benches.clone_parsers import Reference
 
 from bridged import cli
 from bridged.can import AcceptanceFilter, BitTiming

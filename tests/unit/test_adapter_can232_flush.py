@@ -5,10 +5,10 @@ import contextlib
 import itertools
 import re
 
-import clone_parsers
 import pytest
-from can232_host import Host, adapter_for
-from clone_parsers import OTHERS, Canable2, Esp32, Firmware, Reference, Slcanpty, Usbtin
+from benches import clone_parsers
+from benches.can232_host import Host, adapter_for
+from benches.clone_parsers import OTHERS, Canable2, Esp32, Firmware, Reference, Slcanpty, Usbtin
 
 from bridged.errors import AdapterError
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import usb.backend.libusb1
-from fake_libusb import Chip, FakeLibusb, usb_error
+from benches.fake_libusb import Chip, FakeLibusb, usb_error
 from usb.core import USBError
 
 from bridged.errors import PortError

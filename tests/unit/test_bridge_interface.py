@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
-from test_bridge import PairBus
+from benches.bridge import PairBus
 
 from bridged.bridge import interface as bus_end
 from bridged.bridge.interface import RETRY_S, Interface

@@ -4,8 +4,9 @@ import re
 import threading
 
 import pytest
-from can232_host import Host, adapter_for
-from clone_parsers import (
+from benches.bridge import Bench, PairPort, started, stopped
+from benches.can232_host import Host, adapter_for
+from benches.clone_parsers import (
     OTHERS,
     Canable1,
     Canable2,
@@ -22,7 +23,6 @@ from clone_parsers import (
     Usbtin,
     Weact,
 )
-from test_bridge import Bench, PairPort, bench, run_until, started, stopped  # noqa: F401 - a fixture
 
 from bridged.bridge.lifecycle import State
 from bridged.errors import AdapterError, WrongDeviceError
@@ -225,7 +225,7 @@ def test_noise_that_looks_like_text_now_and_then_is_no_answer() -> None:
 
 
 def test_a_long_answer_with_tabs_reaches_the_log(
-    bench: Bench,  # noqa: F811
+    bench: Bench,
 ) -> None:
     port = PairPort()
     bench.open_port = lambda *_args: port
@@ -251,7 +251,7 @@ def test_a_long_answer_with_tabs_reaches_the_log(
 
 
 def test_a_cantact_is_refused_by_the_bridge_without_a_byte(
-    bench: Bench,  # noqa: F811
+    bench: Bench,
 ) -> None:
     port = PairPort()
     port.product = "CANtact dev"
@@ -264,7 +264,7 @@ def test_a_cantact_is_refused_by_the_bridge_without_a_byte(
     assert "calls itself 'CANtact dev'" in reason
 
 
-def test_the_same_can232_is_taken_by_its_name_or_without(bench: Bench) -> None:  # noqa: F811
+def test_the_same_can232_is_taken_by_its_name_or_without(bench: Bench) -> None:
     for options in ({}, {"firmware": "can232"}):
         device = Can232(0.0)
         bench.plug_in(device)

@@ -1,0 +1,1 @@
+"""What several test modules share: simulated devices and hosts, relays and bridges on them."""
