@@ -53,7 +53,7 @@ class PortName:
     @property
     def is_numbered_terminal(self) -> bool:
         """Whether it is /dev/pts/N itself, and no link to it: a name that the kernel uses again and again."""
-        return re.fullmatch(r"/dev/pts/\d+", os.path.normpath(self.path)) is not None
+        return re.fullmatch(r"//?dev/pts/\d+", os.path.normpath(self.path)) is not None
 
     def problem(
         self, schemes: Sequence[str] = SCHEMES, refused: Mapping[str, str] = MappingProxyType({})

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -607,31 +606,12 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "1:49: bus.channel: expected the name of an interface, got a mapping",
         f"1:68: bus.bus: unknown key; allowed here: {BUS_KEYS}",
     ]),
-    # YAML
-    "tab": ("adapter:\n\ttype: can232\n", ["2:1: not valid YAML: indent with spaces, not with tabs (found character '\\t' that cannot start any token)"]),
-    "indentation": ("adapter:\n  type: can232\n port: x\n", [
-        "3:2: not valid YAML: the indentation does not fit the lines above (expected <block end>, but found '<block mapping start>')",
-    ]),
-    "colons": ("adapter: type: can232\n", ["1:14: not valid YAML: there is a ':' too many, or the indentation is wrong (mapping values are not allowed here)"]),
-    "no colon": ("adapter: {}\nchannel\nbus: {}\n", ["3:1: not valid YAML: a key lacks its ':' and a space (could not find expected ':')"]),
-    "two documents": ("a: b\n---\nc: d\n", ["2:1: not valid YAML: a file holds one configuration, so no second '---' (but found another document)"]),
-    "alias": ("a: *b\n", ["1:4: not valid YAML: a value that begins with '*' is written in quotes (found undefined alias 'b')"]),
-    "unclosed": ("adapter: {type: can232\n", ["2:1: not valid YAML: expected ',' or '}', but got '<stream end>'"]),
-    "escape": ('a: "\\UFFFFFFFF"\n', ["1:7: not valid YAML: a number is out of range"]),
-    "control character": ("a: 1\nb: \x07\n", ["2:4: not valid YAML: character U+0007 is not allowed"]),
-    "latin-1": (b"a: 1\nb: gr\xf6\xdfe\n", ["2:6: byte 0xF6 is not UTF-8; save the file as UTF-8"]),
-    "utf-16": ("a: b".encode("utf-16"), ["1:1: byte 0xFF is not UTF-8; save the file as UTF-8"]),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("content", "expected"), CASES.values(), ids=CASES.keys())
 def test_problems(file: Path, content: str | bytes, expected: list[str]) -> None:
     assert problems_of(file, content) == expected
-
-
-def test_nested_too_deeply(file: Path) -> None:
-    [problem] = problems_of(file, "a: " + "[" * 60_000)
-    assert re.fullmatch(r"1:\d+: not valid YAML: nested too deeply", problem)
 
 
 @needs_calculator
@@ -653,28 +633,6 @@ def test_python_can_too_old(file: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "2:42: channel.sample_point: the bit timing for 125000 bit/s takes python-can 4.3 or newer; "
         "or give btr0 and btr1"
     ]
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    missing, large = tmp_path / "missing.yaml", tmp_path / "large.yaml"
-    large.write_bytes(b"#" * 65_537)
-    for path, text in [
-        (missing, "cannot be read: No such file or directory"),
-        (tmp_path, "cannot be read: Is a directory"),
-        (large, "is larger than 65536 bytes: not a configuration"),
-        (Path("/dev/zero"), "is larger than 65536 bytes: not a configuration"),
-    ]:
-        with pytest.raises(ConfigError) as caught:
-            load(path)
-        assert caught.value.problems == [f"{path}: {text}"]
-        assert str(caught.value) == f"{path}: {text}"
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
-def test_a_file_without_permission(file: Path) -> None:
-    file.touch(mode=0)
-    with pytest.raises(ConfigError, match="cannot be read: Permission denied"):
-        load(file)
 
 
 def test_every_value_has_a_description() -> None:

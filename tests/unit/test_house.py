@@ -1,4 +1,4 @@
-"""The house: who may import whom, and where an adapter's name may stand.
+"""The house: who may import whom, where an adapter's name may stand, and where a module's tests are.
 
 Imports only needed for types count too: what a part knows, it knows also in its annotations.
 """
@@ -104,3 +104,48 @@ def test_no_circle() -> None:
 
     for module in graph:
         visit(module, ())
+
+
+# --- where the tests are ----------------------------------------------------------------------
+
+TREES = {path.stem: ast.parse(path.read_text()) for path in sorted(Path(__file__).parent.glob("test_*.py"))}
+FEW = 20  # statements in a module's functions: with fewer, as values and contracts have, others test it
+
+
+def places_of(module: str) -> list[str]:
+    """What the test files of a module may begin with: its name, and where that is not enough its room before.
+
+    daemon.status: test_status or test_daemon_status; adapters.can232: test_adapter_can232 (there is a
+    simulators.can232); bridge.interface: test_bridge_interface (there are interfaces). A module that is a
+    part of another, as usb2can_firmware of usb2can, is tested with that.
+    """
+    room, _, stem = module.rpartition(".")
+    beginnings = (stem[:at] for at, letter in enumerate(stem) if letter == "_")
+    stem = next((whole for whole in beginnings if f"{room}.{whole}" in MODULES), stem)
+    rooms = {part(name).removesuffix("s") for name in MODULES if "." in name}
+    alone = [name.rpartition(".")[2] for name in MODULES].count(stem) == 1 and stem not in rooms
+    plain = [f"test_{stem}"] if alone or room in ("", stem) else []
+    return plain + ([f"test_{room.removesuffix('s')}_{stem}"] if room else [])
+
+
+def statements(tree: ast.Module) -> int:
+    """How many statements the functions of a module have that are more than a name and a docstring."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    bodies = [node.body for node in functions if any(not isinstance(s, ast.Expr) for s in node.body)]
+    return sum(isinstance(node, ast.stmt) for body in bodies for s in body for node in ast.walk(s))
+
+
+@pytest.mark.parametrize("module", [name for name, tree in MODULES.items() if statements(tree) >= FEW])
+def test_a_module_has_its_tests_where_one_looks_for_them(module: str) -> None:
+    places = places_of(module)
+    found = [file for file in TREES if any(file == name or file.startswith(f"{name}_") for name in places)]
+    assert found, f"bridged.{module} has no tests/unit/{' or '.join(f'{name}*.py' for name in places)}"
+
+
+@pytest.mark.parametrize("file", TREES)
+def test_no_test_module_is_a_library(file: str) -> None:
+    """What several test modules share is in tests/unit/benches and tests/books.py."""
+    for node in ast.walk(TREES[file]):
+        imported = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        imported += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        assert not {name.partition(".")[0] for name in imported} & TREES.keys()

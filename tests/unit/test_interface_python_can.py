@@ -20,7 +20,7 @@ import pytest
 from can.interfaces import udp_multicast, virtual
 
 from bridged.errors import BusError
-from bridged.interfaces import open_bus, python_can, socketcan
+from bridged.interfaces import open_bus, python_can
 from bridged.interfaces.base import LOST_ERROR_FRAMES
 from bridged.interfaces.python_can import PythonCanBus, pack_message, unpack_frame
 
@@ -363,53 +363,3 @@ class TestOpenErrors:
         assert isinstance(bus, PythonCanBus)
         assert bus._bus.queue.maxsize == 3  # type: ignore[attr-defined]
         bus.close()
-
-
-def has_can() -> bool:
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError:
-        return False
-    return True
-
-
-class TestSocketcan:
-    """What needs no CAN in the kernel; the rest is tests/system/test_buses_socketcan.py."""
-
-    @pytest.mark.skipif(has_can(), reason="this kernel has CAN")
-    def test_kernel_without_can(self) -> None:
-        with pytest.raises(BusError, match=r"no SocketCAN: try `modprobe can_raw`") as caught:
-            open_bus("socketcan", "vcan0", create=True, options={})
-        assert isinstance(caught.value.__cause__, OSError)
-
-    @pytest.mark.parametrize("name", ["", "a/b", "0123456789abcdef", "vcan 0", "vcan0\n"])
-    def test_names_that_no_interface_can_have(self, name: str) -> None:
-        with pytest.raises(BusError, match="is no name of an interface"):
-            open_bus("socketcan", name, create=True, options={})
-
-    @pytest.mark.parametrize(
-        ("code", "advice"),
-        [
-            (
-                errno.EPERM,
-                r"as root, `ip link add dev vcan0 type vcan` and `ip link set vcan0 up`, or Ambient",
-            ),
-            (errno.EOPNOTSUPP, "this kernel has no vcan: try `modprobe vcan`"),
-            (errno.ENOMEM, "cannot be made: Cannot allocate memory"),
-        ],
-    )
-    def test_interface_that_cannot_be_made(
-        self, code: int, advice: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(socketcan, "_request_link", lambda *_: code)
-        with pytest.raises(BusError, match=f"^vcan0: .*{advice}") as caught:
-            socketcan._create_vcan("vcan0")
-        assert isinstance(caught.value.__cause__, OSError)
-
-    def test_somebody_else_made_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(socketcan, "_request_link", lambda *_: errno.EEXIST)
-        socketcan._create_vcan("vcan0")
-
-    def test_kernel_understands_the_request(self) -> None:
-        """The request itself: a kind that no kernel has is refused as such, and not as malformed."""
-        assert socketcan._request_link("bridgetest", b"nonsense") in {errno.EOPNOTSUPP, errno.EPERM}

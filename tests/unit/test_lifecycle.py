@@ -1,17 +1,15 @@
-"""The lifecycle's table, pair by pair; what the log repeats; and the whole in simulated time."""
+"""The lifecycle's table, pair by pair; and the whole in simulated time."""
 
 from __future__ import annotations
 
 import itertools
-import string
 
 import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bridged.bridge.backoff import JITTER, STABLE_S, Backoff
+from bridged.bridge.backoff import JITTER, Backoff
 from bridged.bridge.lifecycle import IGNORED, TABLE, Action, Event, State, transition
-from bridged.bridge.log_limiter import CAUSES_MAX, REPEAT_LOG_S, TOLD_AT_MOST, LogLimiter
 
 # Events that a state can meet, and no others: RELEASE drops what the relay still had to say, a timer is set
 # in four states only, and nobody looks out for the device before the start.
@@ -62,89 +60,6 @@ def test_stop_leads_to_the_end(state: State) -> None:
         assert (after, actions[-2:]) == (State.STOPPED, (Action.RELEASE, Action.FINISH))
     else:
         assert (after, actions) == (State.STOPPED, (Action.FINISH,))
-
-
-# --- pauses -----------------------------------------------------------------------------------
-
-
-def test_pauses_double_to_their_maximum() -> None:
-    backoff = Backoff(0.1, 1.0, lambda: 0.0)
-    assert [backoff.next_s(0.0) for _ in range(5)] == [0.1, 0.2, 0.4, 0.8, 1.0]
-    backoff.hurry()
-    assert backoff.next_s(0.0) == 0.1
-    assert backoff.longest_s() == 1.0
-    assert backoff.next_s(0.0) == 0.2
-
-
-def test_pauses_differ_but_never_exceed_the_maximum() -> None:
-    random = iter([0.0, 0.5, 1.0])
-    backoff = Backoff(5.0, 5.0, lambda: next(random))
-    pauses = [backoff.next_s(0.0), backoff.next_s(0.0), backoff.longest_s()]
-    assert pauses == pytest.approx([5.0, 5.0 * (1 - JITTER / 2), 5.0 * (1 - JITTER)])
-
-
-@pytest.mark.parametrize(("ran_s", "pause_s"), [(STABLE_S - 0.1, 0.8), (STABLE_S, 0.1)])
-def test_only_a_stable_run_makes_pauses_short_again(ran_s: float, pause_s: float) -> None:
-    backoff = Backoff(0.1, 5.0, lambda: 0.0)
-    for _ in range(3):
-        backoff.next_s(1000.0)
-    backoff.runs(1000.0)
-    assert backoff.coming_s(1000.0 + ran_s) == pause_s
-    assert backoff.next_s(1000.0 + ran_s) == pause_s
-    assert backoff.next_s(5000.0) == 2 * pause_s  # it did not run since
-
-
-# --- what is told -----------------------------------------------------------------------------
-
-
-def test_a_cause_is_told_once_until_all_is_well_again() -> None:
-    told = LogLimiter()
-    assert (told.failing, told.quiet) == (False, False)
-    assert [told.tell("a", n) for n in range(3)] == [1, None, None]
-    assert told.tell("b", 3) == 1
-    assert (told.failing, told.quiet) == (True, False)
-    told.well()
-    assert (told.failing, told.quiet) == (False, True)
-    assert told.tell("a", 4) == 3
-    assert told.tell("a", 5) is None
-    assert not told.quiet
-
-
-def test_what_comes_and_goes_is_not_told_each_time() -> None:
-    told = LogLimiter()
-    times = []
-    for n in range(20):
-        times.append(told.tell("flaps", n))
-        told.well()
-    assert times == [1] * TOLD_AT_MOST + [None] * (20 - TOLD_AT_MOST)
-    assert told.tell("flaps", 20) is None
-    assert told.quiet  # so that its end is not told either
-
-
-def test_what_lasts_is_told_again_and_how_often_it_came() -> None:
-    told = LogLimiter()
-    times = [told.tell("silent", now) for now in range(0, 2 * int(REPEAT_LOG_S) + 1, 5)]
-    per_time = int(REPEAT_LOG_S) // 5
-    assert [n for n in times if n] == [1, per_time, per_time]
-
-
-def test_causes_are_not_told_apart_by_numbers_and_their_number_is_bounded() -> None:
-    told = LogLimiter()
-    assert [told.tell(f"TEC {n}", 0) for n in range(3)] == [1, None, None]
-    texts = [f"{a}{b}" for a in string.ascii_letters for b in string.ascii_letters]
-    assert sum(told.tell(text, 1) is not None for text in texts) == CAUSES_MAX
-    assert len(told._causes) == CAUSES_MAX + 1
-    assert told.tell("all others are forgotten by then", 3 * REPEAT_LOG_S) == 1
-    assert len(told._causes) == 1
-
-
-def test_an_interval_between_two_lines_of_a_cause() -> None:
-    told = LogLimiter(interval_s=10.0)
-    times = []
-    for now in (0, 5, 9, 10, 19, 20):
-        times.append(told.tell("noise", now))
-        told.well()
-    assert times == [1, None, None, 3, None, 2]
 
 
 # --- the whole, in simulated time -------------------------------------------------------------

@@ -1,7 +1,6 @@
 """The process: signals, reload, what systemd is told. systemd itself is in tests/system/test_systemd.py."""
 
 import fcntl
-import json
 import logging
 import os
 import re
@@ -23,11 +22,11 @@ from bridged.bridge import interface as bus_end
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
 from bridged.config import load
-from bridged.daemon import journal, notify, service
+from bridged.daemon import service
 from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.notify import Notifier
 from bridged.daemon.service import Service
-from bridged.errors import BusError, ConfigError
+from bridged.errors import BusError
 from bridged.interfaces.base import Bus
 from bridged.interfaces.python_can import open_python_can
 
@@ -461,48 +460,6 @@ class TestWatchdog:
         assert bridge.has_turned()
         bridge.close()
 
-    @pytest.mark.parametrize(
-        ("environment", "interval_s"),
-        [
-            ({}, None),
-            ({"WATCHDOG_USEC": "10000000"}, 5.0),
-            ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 5.0),
-            ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
-            ({"WATCHDOG_USEC": "0"}, None),
-            ({"WATCHDOG_USEC": "often"}, None),
-        ],
-    )
-    def test_interval(self, environment: dict[str, str], interval_s: float | None) -> None:
-        assert notify.feed_interval_s(environment) == interval_s
-
-
-class TestNotifier:
-    def test_nobody_asked(self) -> None:
-        made = notify.systemd_notifier({})
-        made.ready()
-        assert made.feed_interval_s is None
-
-    def test_a_status_is_one_line_and_told_once(self) -> None:
-        heard: list[str] = []
-        made = Notifier(heard.append)
-        for text in ("a\nREADY=1", "a\nREADY=1", "c\udcff"):
-            made.status(text)
-        assert heard == ["STATUS=a\\nREADY=1", "STATUS=c\\xff"]
-
-    def test_a_systemd_that_does_not_listen_is_no_reason_to_end(
-        self, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        def refuse(_text: str) -> None:
-            raise ConnectionRefusedError
-
-        Notifier(refuse).ready()
-        assert "cannot notify systemd" in caplog.text
-
-    def test_a_missing_package_is_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "systemd", None)
-        with pytest.raises(ConfigError, match="python3-systemd"):
-            notify.systemd_notifier({"NOTIFY_SOCKET": "/run/systemd/notify"})
-
 
 @pytest.mark.parametrize(
     ("state", "reason", "bus_open", "line"),
@@ -528,49 +485,6 @@ def test_status_line(state: State, reason: str, bus_open: bool, line: str) -> No
         ),
     )
     assert service._describe(bridge, state, reason, bus_open=bus_open) == line
-
-
-class TestLog:
-    def record(self, level: int = logging.WARNING, text: str = "one\ntwo") -> logging.LogRecord:
-        return logging.LogRecord("bridged.x", level, __file__, 1, text, (), None)
-
-    def test_fields(self) -> None:
-        fields = journal.Fields("can232")
-        fields.state = lambda: "running"
-        record = self.record()
-        assert fields.filter(record)
-        assert json.dumps([record.__dict__["BRIDGE"], record.__dict__["STATE"]]) == '["can232", "running"]'
-
-    def test_each_line_of_a_traceback_has_its_priority(self) -> None:
-        made = journal.PrefixFormatter("can232: %(message)s")
-        record = self.record()
-        record.exc_text = "Traceback\nValueError"
-        assert made.format(record).splitlines() == ["<4>can232: one\\ntwo", "<4>Traceback", "<4>ValueError"]
-        assert made.format(self.record(logging.INFO, "x")) == "<6>can232: x"
-
-    def test_a_device_writes_no_line_of_its_own(
-        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        monkeypatch.setattr(logging, "root", logging.RootLogger(logging.WARNING))
-        monkeypatch.setattr(journal.StderrHandler, "emit", logging.StreamHandler.emit)
-        journal.start_logging("50%s\udcff", verbose=False)
-        logging.root.info("serial_number=%s", "A\x1b[2J\n12:00:00 INFO    all is well")
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.endswith(r"INFO    50%s\xff: serial_number=A\x1b[2J\n12:00:00 INFO    all is well")
-
-    def test_stderr_is_the_journal_only_if_it_is_the_same_stream(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        with (tmp_path / "stream").open("w") as stream:
-            monkeypatch.setattr(sys, "stderr", stream)
-            monkeypatch.delenv("JOURNAL_STREAM", raising=False)
-            assert not journal._stderr_is_journal()
-            identity = os.fstat(stream.fileno())
-            monkeypatch.setenv("JOURNAL_STREAM", f"{identity.st_dev}:{identity.st_ino}")
-            assert journal._stderr_is_journal()
-            monkeypatch.setenv("JOURNAL_STREAM", f"{identity.st_dev}:{identity.st_ino + 1}")
-            assert not journal._stderr_is_journal()
-        assert not journal._stderr_is_journal()
 
 
 def test_sighup_of_a_terminal_stops_and_of_a_service_reloads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
-"""The simulator in real time: a real pseudo terminal, a socket as its bus, its options and files."""
+"""The simulator in real time: a real pseudo terminal, a socket as its bus, made-up traffic, its files."""
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -12,7 +13,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from benches.simulating import TIMEOUT_S, ask, by_hand, host, process, read, running, until
+from benches.simulating import (
+    START,
+    START_ANSWER,
+    TIMEOUT_S,
+    ask,
+    by_hand,
+    host,
+    process,
+    read,
+    running,
+    until,
+)
 
 from bridged.errors import BusError, PortError
 from bridged.simulators.can232 import Can232
@@ -20,9 +32,10 @@ from bridged.simulators.can232_memory import Eeprom
 from bridged.simulators.cli import load_eeprom
 from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
 from bridged.simulators.faults import Fault, parse_fault
-from bridged.simulators.serve import Simulator, mixed_frames
+from bridged.simulators.serve import CYCLIC, Simulator, cyclic_frames, mixed_frames, record_line
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.uart import Uart
+from bridged.simulators.usb2can import State, Usb2can
 
 FRAME = Frame(0x100, False, False, 2, b"\x11\x33")
 
@@ -297,3 +310,95 @@ def test_the_command_keeps_its_eeprom_and_ends_with_0(tmp_path: Path, number: si
         assert not link.is_symlink()
         state.unlink()
     assert json.loads((tmp_path / "eeprom").read_text())["writes"] == 2
+
+
+def test_a_host_that_does_not_read_holds_a_usb2can_back():
+    device = Usb2can(time.monotonic())
+    simulator = Simulator(device, traffic_fps=50_000)
+    with running(simulator), host(simulator.port) as fd:
+        ask(fd, START, START_ANSWER)
+        until(lambda: device.counters.overruns)
+        os.write(fd, b"\x0f\x40\x05\x02\x20\x00\x11\x33")
+        until(lambda: device.counters.frames_sent)
+        assert simulator.state()["host_lost"] == 0
+
+
+def test_the_faults_of_a_usb2can():
+    device = Usb2can()
+    simulator, clock = by_hand(device, "value2@1", "lostgo@2+1", "lostgo@4", "overrun@6")
+    with running(simulator), host(simulator.port) as fd:
+        ask(fd, START, START_ANSWER)
+        clock.set(1)
+        assert read(fd, 100) == b"\x0f\x09\x02\x02\x02" * 20
+        clock.set(2)
+        until(lambda: device.lose_go > 1)
+        clock.set(3)
+        until(lambda: not device.lose_go)
+        clock.set(4)
+        until(lambda: device.lose_go == 1)
+        clock.set(6)
+        assert read(fd, 4) == b"\x0f\x09\x01\x03"
+    assert device.state is State.NORMAL
+
+
+def test_counted_frames_are_not_spent_on_a_channel_that_is_not_open():
+    twin = Can232(eeprom=Eeprom(auto_poll=True))
+    twin.host_writes(0.0, b"S8\rO\r")
+    twin.take_output(0.0)
+    lines = []
+    for frame, _ in zip(mixed_frames(random.Random(0)), range(60), strict=False):
+        twin.bus_frame(0.0, frame)
+        lines.append(twin.take_output(0.0))
+    device = Can232(eeprom=Eeprom(auto_poll=True))
+    counters = device.counters
+    simulator, clock = by_hand(device, traffic_fps=1000, traffic_count=60)
+    with running(simulator), host(simulator.port) as fd:
+        clock.set(0.0205)
+        until(lambda: counters.frames_unseen == 20)
+        ask(fd, b"S8\rO\r", b"\r\r")
+        clock.set(0.0505)
+        ask(fd, b"", b"".join(lines[:30]))
+        ask(fd, b"C\r", b"\r")
+        clock.set(0.0805)
+        until(lambda: counters.frames_unseen == 50)
+        ask(fd, b"O\r", b"\r")
+        clock.set(0.1205)
+        ask(fd, b"", b"".join(lines[30:]))
+        clock.set(0.1605)
+        ask(fd, b"V\r", b"V1324\r")
+    assert simulator.state()["traffic"] == {"count": 60, "made_up": 60}
+
+
+def test_a_bus_that_was_late_does_not_catch_up():
+    simulator, clock = by_hand(traffic_fps=1000)
+    with running(simulator):
+        clock.set(100.0005)
+        until(lambda: simulator.device.counters.frames_unseen > 40)
+        clock.set(100.0015)
+    assert 50 <= simulator.device.counters.frames_unseen <= 52
+
+
+def test_cyclic_traffic():
+    """Ten identifiers whose first bytes count, each at its own rate; the same with the same seed."""
+    frames = list(itertools.islice(cyclic_frames(random.Random(3)), 6400))
+    assert frames == list(itertools.islice(cyclic_frames(random.Random(3)), 6400))
+    per_unit = sum(1 / period for _, _, period in CYCLIC)
+    for can_id, dlc, period in CYCLIC:
+        own = [frame for frame in frames if frame.can_id == can_id]
+        assert abs(len(own) - 6400 / period / per_unit) <= 1
+        assert {(len(frame.data), frame.dlc, frame.remote) for frame in own} == {(dlc, dlc, False)}
+        assert [frame.data[:2] for frame in own] == [
+            (count % 256 ** min(dlc, 2)).to_bytes(min(dlc, 2), "little") for count in range(len(own))
+        ]
+        assert len({frame.data[2:] for frame in own}) == 1
+
+
+def test_what_is_recorded_is_what_cansend_takes():
+    lines = {
+        Frame(0x123, False, False, 2, b"\x11\x22"): "123#1122\n",
+        Frame(0x123, True, False, 1, b"\xab"): "00000123#AB\n",
+        Frame(0x12345678, True, False, 0, b""): "12345678#\n",
+        Frame(0x123, False, True, 5, b""): "123#R5\n",
+        Frame(0x7, False, True, 0, b""): "007#R\n",
+    }
+    assert [record_line(frame) for frame in lines] == list(lines.values())

@@ -18,6 +18,18 @@ from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, parse_fault
 from bridged.simulators.serve import Simulator
 
 TIMEOUT_S = 20
+# A USB2CAN, from its power-up to frames at 1 Mbit/s, and what it answers to that.
+_PASS_ALL = b"".join(b"\x0f\x12\x02" + bytes((16 + n, 0 if n < 4 else 0xFF)) for n in range(8))
+START = (
+    b"\x0f\x02\x00"  # CONFIG_MODE
+    b"\x0f\x12\x02\x00\x01\x0f\x12\x02\x1f\xc0" + _PASS_ALL + b"\x0f\x12\x02\x08\xda\x0f\x12\x02\x04\x03"
+    b"\x0f\x12\x02\x06\x00\x0f\x12\x02\x07\x14"  # 1 Mbit/s
+    b"\x0f\x20\x02\x00\x0f\x0f\x20\x02\x01\x07"  # limits
+    b"\x0f\x03\x00\x0f\x12\x02\x00\x00"  # NORMAL_MODE, MOD
+)
+START_ANSWER = b"\xff\xff" + b"".join(
+    b"\x0f\x12\x01" + bytes((register,)) for register in (0, 31, *range(16, 24), 8, 4, 6, 7, 0)
+)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,48 @@
+"""`can-bridge demo`: frames both ways without any hardware."""
+
+import argparse
+import re
+from typing import Any, NoReturn
+
+import can
+import pytest
+
+from bridged import demo
+from bridged.errors import NO_CAN, BusError
+
+
+@pytest.mark.parametrize("adapter", ["can232", "usb2can"])
+def test_frames_go_both_ways_and_all_is_closed(
+    adapter: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a kernel without CAN, so that no interface of this machine has anything to do with it."""
+
+    def no_can(*_args: object, **_options: object) -> NoReturn:
+        raise BusError(NO_CAN)
+
+    monkeypatch.setattr(demo, "open_socketcan", no_can)
+    parser = argparse.ArgumentParser()
+    demo.add_arguments(parser)
+    assert demo.run(parser.parse_args([adapter, "--duration", "1", "--rate", "50"])) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"# Simulated {adapter.upper()} on /dev/pts/")
+    assert any(line.endswith("   from the adapter") for line in lines)
+    assert any(line.endswith("   to the adapter") for line in lines)
+    done = next(line for line in lines if line.startswith("# Done: "))
+    counts = re.search(r"received (\d+) frames on demo, sent (\d+), all confirmed by the adapter", done)
+    assert counts
+    assert min(map(int, counts.groups())) > 0
+    assert done.endswith("Its channel is closed.")
+
+
+@pytest.mark.parametrize(
+    ("message", "line"),
+    [
+        ({"arbitration_id": 0x123, "data": b"\xaa\xbb"}, "       123   [2]  AA BB"),
+        ({"arbitration_id": 0x123, "is_extended_id": True}, "  00000123   [0]  "),
+        ({"arbitration_id": 1, "is_remote_frame": True, "dlc": 3}, "       001   [3]  remote request"),
+    ],
+)
+def test_lines_are_as_candump_prints_them(message: dict[str, Any], line: str) -> None:
+    fields = {"is_extended_id": False} | message
+    assert demo.candump_line("vcan0", can.Message(**fields)) == f"  vcan0{line}"
