@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 EX_CONFIG = 78  # sysexits.h
 WATCH_INTERVAL_S = 1.0
 EXIT_NOT_RUNNING = 3  # as systemctl status
+PROBES = ("started", "ready", "live")  # see daemon/probes.py
 CONFIG_DIRECTORY = Path("/etc/can-bridge")
 HELP_WIDTH = 98
 OUTPUT_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
@@ -214,11 +215,31 @@ def _ask(args: argparse.Namespace) -> tuple[str, bool]:
 
 
 def _status(args: argparse.Namespace) -> int:
+    if args.check:
+        return _probe(args)
     if args.watch:
         return _watch(args)
     text, all_run = _ask(args)
     print(text)
     return 0 if all_run else EXIT_NOT_RUNNING
+
+
+def _probe(args: argparse.Namespace) -> int:
+    """One line for each bridge; 0: it holds for all, 1: not for one that answers, 3: one does not answer."""
+    from bridged.daemon.probes import answer  # noqa: PLC0415
+    from bridged.daemon.status import StatusError, query  # noqa: PLC0415
+
+    statuses = {0}
+    for path in _status_paths(args):
+        try:
+            holds, line = answer(args.check, query(path))
+        except StatusError as error:
+            line = printable(f"{path.stem}: not {args.check}: {error}")
+            statuses.add(EXIT_NOT_RUNNING)
+        else:
+            statuses.add(0 if holds else 1)
+        print(line)
+    return max(statuses)
 
 
 def _watch(args: argparse.Namespace) -> int:
@@ -316,6 +337,12 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
         "--json",
         action="store_true",
         help="print JSON, for programs: an object for each bridge, in one line if there are several",
+    )
+    status.add_argument(
+        "--check",
+        choices=PROBES,
+        help="a probe, one line: started (the interface is up, adapter or not), ready (frames pass), live "
+        "(the process turns, adapter or not); exit status 0 yes, 1 no, 3 no bridge answers",
     )
     status.add_argument(
         "--watch",

@@ -341,6 +341,7 @@ class Bridge:
                 "interface": self.config.bus.interface,
                 "channel": self.config.bus.channel,
                 "open": self._interface.bus is not None,
+                "up": self._interface.is_up,
             },
             "counters": _sum(self._counted_before, counted),
             "queued": queued,

@@ -76,6 +76,11 @@ class Interface:
             self.reason = reason
             self.retry_at = time.monotonic() + RETRY_S
 
+    @property
+    def is_up(self) -> bool:
+        """Whether it is open and carries frames."""
+        return self.bus is not None and not self.reason
+
     def adopt(self, config: Config) -> None:
         """Other settings, but for the interface."""
         self._config = config

@@ -3,7 +3,8 @@
 version (of can-bridge), name, state, reason, channel_open (None: the adapter was never asked; true also where
 it did not say), bus_state, tec, rec (None: not known), rates {rx_fps, tx_fps: frames a second},
 answer_time_ms {min, median, max: of the adapter's last answers to questions about its bus},
-adapter {type, port, version, serial_number}, bus {interface, channel, open},
+adapter {type, port, version, serial_number}, bus {interface, channel, open, up: it is open and carries
+frames},
 counters {rx_frames: frames put on the bus; tx_frames: frames the adapter took; rx_errors: pieces of noise
 from the adapter; tx_retries: frames sent once more; tx_returned: frames the adapter handed back; tx_stops,
 rx_overruns: how often it said "stop", "I lost frames"; reconnects: how often it ran again;
@@ -265,6 +266,12 @@ def _who_may(path: Path) -> str:
     if path.parent == SYSTEM_DIRECTORY:
         advice += f"; to do without, install systemd/can-bridge.sysusers and join group {GROUP}"
     return f"it is the bridge of {user_name(found.st_uid)}: {advice}"
+
+
+def is_started(status: dict[str, Any]) -> bool:
+    """Whether the interface is up, so that programs can use it, adapter or not."""
+    bus = status.get("bus")
+    return isinstance(bus, dict) and bool(bus.get("up"))
 
 
 def is_running(status: dict[str, Any]) -> bool:

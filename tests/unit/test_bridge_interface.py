@@ -162,9 +162,10 @@ def test_down_and_up_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> No
     end.on_down()
     end.on_down()
     bench.pass_time(3600.0)
-    assert end.reason == DOWN
+    assert (end.reason, end.is_up) == (DOWN, False)
     bench.up = True
     bench.pass_time(RETRY_S)
+    assert end.is_up
     assert (end.reason, end.next_at, len(bench.buses)) == ("", None, 1)
     assert lines(caplog) == ["bus open: pair", DOWN, "interface vcan0 is up again"]
 

@@ -162,6 +162,80 @@ class TestStatus:
         assert text.splitlines() == ["can232: waiting, up ", "9 s", "  reason      there "]
 
 
+class TestProbes:
+    """`status --check`, as a container engine runs it: an exit status and one line."""
+
+    @pytest.mark.parametrize(
+        ("changes", "holding", "because"),
+        [
+            ({}, {"started", "ready", "live"}, "running"),
+            (
+                {"state": "waiting", "reason": "/dev/ttyUSB0: does not exist"},
+                {"started", "live"},
+                "waiting (/dev/ttyUSB0: does not exist)",
+            ),
+            ({"state": "bus-off"}, {"started", "live"}, "bus-off"),
+            (
+                {"bus": snapshot()["bus"] | {"up": False}, "reason": "interface vcan0 is down"},
+                {"live"},
+                "running (interface vcan0 is down)",
+            ),
+            (
+                {"state": "idle", "bus": {"open": False, "up": False}, "reason": "bus not open: x\n"},
+                {"live"},
+                "idle (bus not open: x\\n)",
+            ),
+        ],
+        ids=["running", "no adapter", "bus-off", "interface down", "no interface"],
+    )
+    def test_the_three(
+        self,
+        run: Path,
+        capsys: pytest.CaptureFixture[str],
+        changes: dict[str, Any],
+        holding: set[str],
+        because: str,
+    ) -> None:
+        with serving(run / "can232.sock", snapshot() | changes):
+            for probe in cli.PROBES:
+                holds = probe in holding
+                assert cli.main(["status", "--check", probe]) == (0 if holds else 1)
+                line = f"can232: {probe if holds else f'not {probe}'}, {because}\n"
+                assert capsys.readouterr() == (line, "")
+
+    def test_of_several_the_worst_counts(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        waiting = snapshot("b", state="waiting")
+        with serving(run / "a.sock", snapshot("a")), serving(run / "b.sock", waiting):
+            assert cli.main(["status", "--check", "started"]) == 0
+            assert capsys.readouterr().out == "a: started, running\nb: started, waiting\n"
+            assert cli.main(["status", "--check", "ready"]) == 1
+            assert cli.main(["status", "--check", "ready", "a"]) == 0
+            (run / "b.sock").rename(run / "c.sock")
+            (run / "b.sock").touch()
+            capsys.readouterr()
+            assert cli.main(["status", "--check", "live"]) == 3
+        out = capsys.readouterr().out
+        assert out.startswith(f"a: live, running\nb: not live: no bridge answers on {run}/b.sock: ")
+
+    @pytest.mark.usefixtures("run", "configs")
+    def test_nobody_answers(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["status", "--check", "live", "can232"]) == 3
+        assert capsys.readouterr().err.startswith("can-bridge: can232 is not running: start it")
+
+    def test_costs_a_moment(self, run: Path) -> None:
+        """It runs every few seconds: nothing that it can do without is loaded. 0.04 s in all."""
+        script = (
+            "import sys; from bridged import cli; cli.main(sys.argv[1:]); "
+            "print({*sys.modules} & {'msgspec', 'yaml', 'asyncio', 'subprocess', 'can', 'serial', 'usb'})"
+        )
+        with serving(run / "can232.sock", snapshot()):
+            command = ["status", "--check", "live", "--socket", str(run / "can232.sock")]
+            done = subprocess.run(
+                [sys.executable, "-P", "-c", script, *command], capture_output=True, text=True, check=True
+            )
+        assert done.stdout == "can232: live, running\nset()\n"
+
+
 class TestPipes:
     def can_bridge(
         self, *arguments: str, redirect: str, **environment: str

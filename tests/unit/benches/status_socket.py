@@ -29,7 +29,7 @@ def snapshot(name: str = "can232", **changes: Any) -> dict[str, Any]:
         "rates": {"rx_fps": 10.0, "tx_fps": 42.0},
         "answer_time_ms": {"min": 0.4, "median": 0.6, "max": 2.0},
         "adapter": {"type": "can232", "port": "/dev/ttyUSB0", "version": "V1010", "serial_number": "A123"},
-        "bus": {"interface": "socketcan", "channel": "vcan0", "open": True},
+        "bus": {"interface": "socketcan", "channel": "vcan0", "open": True, "up": True},
         "counters": counters | dropped,
         "queued": 0,
         "uptime_s": 9.3,
