@@ -280,8 +280,9 @@ def _complain(text: str) -> None:
     print(f"can-bridge: {printable(text)}", file=sys.stderr)
 
 
-def _parser(command: str | None) -> argparse.ArgumentParser:
-    """The parser; only `command` gets its options, since those of a simulator cost its import."""
+def _parser(arguments: list[str]) -> argparse.ArgumentParser:
+    """The parser; only the command, and the simulator, that is named gets its options: they cost imports."""
+    command = arguments[0] if arguments else None
 
     def formatter(prog: str) -> argparse.HelpFormatter:
         """With the terminal's width argparse would load shutil, and that the compression libraries: 5 ms."""
@@ -354,17 +355,19 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
         "simulate", "Simulate an adapter on a pseudo terminal, or on an existing device or socket.", _simulate
     )
     if command == "simulate":
-        from bridged.simulators import cli as simulators  # noqa: PLC0415
+        from bridged.simulators import SIMULATORS, simulator  # noqa: PLC0415
+        from bridged.simulators.cli import add_arguments as add_simulator  # noqa: PLC0415
 
         kinds = simulate.add_subparsers(dest="kind", required=True, metavar="ADAPTER")
-        for adapter, text in simulators.ADAPTERS.items():
-            simulators.add_arguments(kinds.add_parser(adapter, help=text), adapter)
+        named = [name for name in arguments[1:2] if name in SIMULATORS]
+        for name in named or SIMULATORS:
+            add_simulator(kinds.add_parser(name, help=simulator(name).TITLE), name)
 
     demo = add("demo", "Show a simulated adapter at work on a CAN interface.", _demo)
     if command == "demo":
-        from bridged.demo import add_arguments  # noqa: PLC0415
+        from bridged.demo import add_arguments as add_demo  # noqa: PLC0415
 
-        add_arguments(demo)
+        add_demo(demo)
     return parser
 
 
@@ -395,7 +398,7 @@ def main(argv: list[str] | None = None) -> int:
 def _perform(arguments: list[str]) -> int:
     command = arguments[0] if arguments else None
     try:
-        args = _parser(command).parse_args(arguments)
+        args = _parser(arguments).parse_args(arguments)
         return int(args.run(args))
     except ConfigError as error:
         for problem in error.problems:

@@ -25,25 +25,21 @@ from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.service import serve
 from bridged.errors import NO_CAN, BusError
 from bridged.interfaces.socketcan import open_socketcan
-from bridged.simulators.can232 import Can232
-from bridged.simulators.cli import ADAPTERS, STOP_GRACE_S, positive
+from bridged.simulators import SIMULATORS, make_device, simulator
+from bridged.simulators.options import positive
 from bridged.simulators.serve import Simulator, cyclic_frames
-from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-    from bridged.simulators.device import Device
-
 CHANNEL = "vcan0"
 UART_RATE = 115_200
 STATUS_INTERVAL_S = 1.0
-CLOSED = ("closed", "config")  # what the two adapters call it
+CLOSED = ("closed", "config")  # what the devices call it
 CONFIG = """\
 adapter:
-  type: {adapter}
-  port: {port}{baudrate}
+{adapter}
 channel:
   bitrate: 125000
 bus:
@@ -54,8 +50,9 @@ bus:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `can-bridge demo`."""
+    first = next(iter(SIMULATORS))
     parser.add_argument(
-        "adapter", nargs="?", choices=list(ADAPTERS), default="can232", help="which one; default: can232"
+        "adapter", nargs="?", choices=list(SIMULATORS), default=first, help=f"which one; default: {first}"
     )
     parser.add_argument("--duration", type=positive, default=10.0, metavar="SECONDS", help="default: 10")
     parser.add_argument(
@@ -137,15 +134,6 @@ def _interface() -> tuple[str, str]:
     return "socketcan", CHANNEL
 
 
-def _make_device(adapter: str) -> tuple[Device, str]:
-    """The device that is simulated, and the line of its configuration that says the rate of its UART."""
-    if adapter == "can232":
-        return Can232(time.monotonic(), uart=Uart(UART_RATE)), f"\n  baudrate: {UART_RATE}"
-    from bridged.simulators.usb2can import Usb2can  # noqa: PLC0415 - only the adapter in use is loaded
-
-    return Usb2can(time.monotonic(), stop_grace_s=STOP_GRACE_S), ""
-
-
 class _Watch(threading.Thread):
     """Starts the program when the bridge runs, prints a status line each second, stops all in time."""
 
@@ -194,19 +182,19 @@ def _end_serving() -> None:
 
 def run(args: argparse.Namespace) -> int:
     """The demo; 0 if frames went both ways."""
-    device, baudrate = _make_device(args.adapter)
-    simulator = Simulator(device, traffic_fps=args.rate, traffic=cyclic_frames(random.Random(0)))
-    rate = f" at {UART_RATE} Bd" if baudrate else ""
-    print(f"# Simulated {args.adapter.upper()} on {simulator.port}{rate}, bit rate 125 kbit/s.")
-    thread = threading.Thread(target=simulator.run)
+    device = make_device(args.adapter, uart_rate=UART_RATE)
+    serial = {"baudrate": UART_RATE} if hasattr(device, "uart") else {}
+    simulated = Simulator(device, traffic_fps=args.rate, traffic=cyclic_frames(random.Random(0)))
+    rate = f" at {UART_RATE} Bd" if serial else ""
+    print(f"# Simulated {args.adapter.upper()} on {simulated.port}{rate}, bit rate 125 kbit/s.")
+    thread = threading.Thread(target=simulated.run)
     interface, channel = _interface()
+    adapter = {**simulator(args.adapter).ADAPTER, "port": simulated.port, **serial}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "demo.yaml")
         path.write_text(
             CONFIG.format(
-                adapter=args.adapter,
-                port=simulator.port,
-                baudrate=baudrate,
+                adapter="\n".join(f"  {key}: {value}" for key, value in adapter.items()),
                 interface=interface,
                 channel=channel,
             )
@@ -221,7 +209,7 @@ def run(args: argparse.Namespace) -> int:
         finally:
             watch.done.set()
             watch.join()
-            simulator.stop()
+            simulated.stop()
             thread.join()
     counters = bridge.snapshot()["counters"]
     confirmed = counters["tx_frames"]

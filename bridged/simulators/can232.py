@@ -19,14 +19,21 @@ import enum
 import math
 import re
 from collections import deque
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple
 
-from bridged.simulators.can232_memory import Counters, Eeprom
+from bridged.simulators.can232_memory import Counters, Eeprom, load_eeprom
+from bridged.simulators.device import OwnFault
+from bridged.simulators.options import matching, whole
 from bridged.simulators.sja1000 import Frame, accepts, bitrate, frame_bits
 from bridged.simulators.uart import Uart
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    import argparse
+    from collections.abc import Callable, Mapping
+
+TITLE: Final = "LAWICEL CAN232"
+ADAPTER: Final = {"type": "can232"}
 
 OK = b"\r"
 BELL = b"\a"
@@ -60,6 +67,13 @@ class State(enum.Enum):
     LISTEN_ONLY = "listen-only"
 
 
+def _refuse_all(device: Can232, _now: float, times: int) -> None:
+    device.refuses_all = bool(times)
+
+
+FAULTS: Final = {"refuseall": OwnFault("it refuses each command", switch=_refuse_all)}
+
+
 class Can232:
     """The device with its RS232 line; times in seconds of the caller's clock, which must not go back.
 
@@ -70,6 +84,8 @@ class Can232:
     `flags`, and the methods below.
     ValueError if the version is none.
     """
+
+    own_faults: ClassVar[Mapping[str, OwnFault]] = FAULTS
 
     def __init__(
         self,
@@ -129,6 +145,10 @@ class Can232:
             self.bitrate = eeprom.bitrate
             self.code, self.mask = bytes.fromhex(eeprom.code), bytes.fromhex(eeprom.mask)
             self.state = State.OPEN if eeprom.auto_start == 1 else State.LISTEN_ONLY
+
+    @property
+    def title(self) -> str:
+        return f"CAN232 {self.serial_number}"
 
     def power_on(self, now: float) -> None:
         """Power is back, or the device is plugged in; it starts at once."""
@@ -483,3 +503,33 @@ _RULES = {
     )
     for letter in letters
 }
+
+
+# For `can-bridge simulate`
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--uart-rate",
+        type=whole,
+        metavar="BAUD",
+        help="pace the line at this rate; default: as fast as it goes",
+    )
+    version = matching(r"V\d{4}", "a version like V1324")
+    add("--version", type=version, default="V1324", dest="device_version", metavar="V", help="answer to V")
+    serial = matching(r"[0-9A-Z]{4}", "a serial number like A123")
+    add("--serial-number", type=serial, default="A123", metavar="N", help="answer to N, without the N")
+    add("--eeprom", type=Path, metavar="FILE", help="keeps the EEPROM and its write count, as JSON")
+    add("--precise", action="store_true", help="busy-wait for exact timing (uses a whole core)")
+
+
+def make_device(now: float, args: argparse.Namespace) -> Can232:
+    return Can232(
+        now,
+        eeprom=load_eeprom(args.eeprom),
+        uart=Uart(args.uart_rate),
+        version=args.device_version,
+        serial_number=args.serial_number,
+        processing_s=args.processing,
+    )

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections import Counter
+from typing import TYPE_CHECKING
+
+from bridged.errors import PortError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @dataclasses.dataclass
@@ -19,6 +26,16 @@ class Eeprom:
     code: str = "00000000"
     mask: str = "FFFFFFFF"
     writes: int = 0
+
+
+def load_eeprom(path: Path | None) -> Eeprom:
+    """What a Simulator kept in a file, a new EEPROM if there is none; PortError if it is something else."""
+    if path is None or not path.exists():
+        return Eeprom()
+    try:
+        return Eeprom(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise PortError(f"{path}: not an EEPROM file of this simulator: {error}") from error
 
 
 @dataclasses.dataclass

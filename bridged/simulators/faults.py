@@ -6,23 +6,15 @@ import argparse
 import functools
 import re
 import sys
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Mapping
 
-    from bridged.simulators.can232 import Can232
-    from bridged.simulators.device import Device
-    from bridged.simulators.usb2can import Usb2can
+    from bridged.simulators.device import Device, OwnFault
 
-BUS_FAULTS = ("warning", "passive", "busoff")
-HOST_FAULTS = ("silence", "garbage", "refuse", "drop", "reset", "listenonly", "poweroff", "unplug")
-FAULTS = (*HOST_FAULTS, *BUS_FAULTS)
-CAN232_FAULTS = (*FAULTS, "refuseall")
-USB2CAN_FAULTS = (*FAULTS, "lostgo", "value2", "overrun")
-
-MEANINGS = {
+FAULTS: Final = {
     "silence": "the adapter answers nothing",
     "garbage": "noise on the line",
     "refuse": "it refuses a frame, with a duration all",
@@ -34,15 +26,11 @@ MEANINGS = {
     "warning": "its CAN bus is error-warning",
     "passive": "its CAN bus is error-passive",
     "busoff": "its CAN bus is bus-off",
-    "refuseall": "it refuses each command",
-    "lostgo": "it does not say 'go on' after 'stop'",
-    "value2": "20 messages about its transmit buffer, of a value that its document does not know",
-    "overrun": "it has lost received frames",
 }
+"""Those that every device has, and what they mean."""
 
 BURST_S = 0.01  # between two bursts of a fault that lasts
 NOISE_MAX = 16  # bytes in one of them
-VALUE_2_BURST = 20  # messages
 
 
 class Fault(NamedTuple):
@@ -53,7 +41,12 @@ class Fault(NamedTuple):
     duration_s: float = 0.0
 
 
-def parse_fault(text: str, kinds: Sequence[str] = FAULTS) -> Fault:
+def meanings(own: Mapping[str, OwnFault]) -> dict[str, str]:
+    """All faults of a device that has these of its own, and what they mean."""
+    return FAULTS | {kind: fault.meaning for kind, fault in own.items()}
+
+
+def parse_fault(text: str, kinds: Collection[str] = FAULTS.keys()) -> Fault:
     """`KIND@START[+DURATION]` in seconds, as `silence@5+3`; ArgumentTypeError if it is not."""
     match = re.fullmatch(r"([a-z]+[0-9]?)@(\d+\.?\d*)(?:\+(\d+\.?\d*))?", text)
     if not match or match[1] not in kinds:
@@ -63,6 +56,7 @@ def parse_fault(text: str, kinds: Sequence[str] = FAULTS) -> Fault:
 
 def begin(device: Device, fault: Fault, now: float) -> None:
     """It happens to the device at `now`."""
+    times = sys.maxsize if fault.duration_s else 1
     match fault.kind:
         case "silence":
             device.silent = True
@@ -73,19 +67,18 @@ def begin(device: Device, fault: Fault, now: float) -> None:
         case "busoff":
             device.set_bus_off(now, True)
         case "refuse":
-            device.refusals = sys.maxsize if fault.duration_s else 1
-        case "refuseall":
-            _can232(device).refuses_all = True
+            device.refusals = times
         case "drop":
-            device.drop_answers = sys.maxsize if fault.duration_s else 1
-        case "lostgo":
-            _usb2can(device).lose_go = sys.maxsize if fault.duration_s else 1
+            device.drop_answers = times
         case "reset":
             device.power_cycle(now)
         case "listenonly":
             device.set_listen_only(now, True)
         case "poweroff" | "unplug":
             device.power_off(now)
+        case kind if own := device.own_faults.get(kind):
+            if own.switch:
+                own.switch(device, now, times)
 
 
 def end(device: Device, fault: Fault, now: float) -> None:
@@ -99,40 +92,20 @@ def end(device: Device, fault: Fault, now: float) -> None:
             device.set_bus_off(now, False)
         case "refuse":
             device.refusals = 0
-        case "refuseall":
-            _can232(device).refuses_all = False
         case "drop":
             device.drop_answers = 0
-        case "lostgo":
-            _usb2can(device).lose_go = 0
         case "listenonly":
             device.set_listen_only(now, False)
         case "poweroff" | "unplug":
             device.power_on(now)
+        case kind if own := device.own_faults.get(kind):
+            if own.switch:
+                own.switch(device, now, 0)
 
 
 def repeated(device: Device, fault: Fault, noise: random.Random) -> Callable[[float], None] | None:
     """What happens every BURST_S until it is over, or once if it has no duration; None: nothing does."""
-    match fault.kind:
-        case "garbage":
-            return lambda now: device.garbage(now, noise.randbytes(noise.randint(1, NOISE_MAX)))
-        case "value2":
-            return functools.partial(_usb2can(device).value_2_burst, count=VALUE_2_BURST)
-        case "overrun":
-            return _usb2can(device).overrun
-    return None
-
-
-def _can232(device: Device) -> Can232:
-    """The device, whose fault only it has; so below."""
-    from bridged.simulators.can232 import Can232  # noqa: PLC0415 - only the adapter in use is loaded
-
-    assert isinstance(device, Can232)
-    return device
-
-
-def _usb2can(device: Device) -> Usb2can:
-    from bridged.simulators.usb2can import Usb2can  # noqa: PLC0415 - as above
-
-    assert isinstance(device, Usb2can)
-    return device
+    if fault.kind == "garbage":
+        return lambda now: device.garbage(now, noise.randbytes(noise.randint(1, NOISE_MAX)))
+    own = device.own_faults.get(fault.kind)
+    return functools.partial(own.burst, device) if own and own.burst else None

@@ -27,8 +27,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
+from bridged.simulators.device import OwnFault
+from bridged.simulators.options import matching, whole
 from bridged.simulators.sja1000 import MOD, Frame, accepts
 from bridged.simulators.usb2can_firmware import ACCEPT_ALL, LIMITS_REPEAT_S, Counters, Firmware
 from bridged.simulators.usb2can_messages import (
@@ -45,7 +47,41 @@ from bridged.simulators.usb2can_messages import (
     Variant,
 )
 
-__all__ = ["Counters", "State", "Usb2can"]
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Mapping
+
+__all__ = [
+    "ADAPTER",
+    "FAULTS",
+    "STOP_GRACE_S",
+    "TITLE",
+    "Counters",
+    "State",
+    "Usb2can",
+    "add_arguments",
+    "make_device",
+]
+
+TITLE: Final = "CANLAB USB2CAN"
+ADAPTER: Final = {"type": "usb2can"}
+
+STOP_GRACE_S = 5.0  # frames that the host sent before it read a STOP may be on their way for so long
+VALUE_2_BURST = 20  # messages
+
+
+def _lose_go(device: Usb2can, _now: float, times: int) -> None:
+    device.lose_go = times
+
+
+FAULTS: Final = {
+    "lostgo": OwnFault("it does not say 'go on' after 'stop'", switch=_lose_go),
+    "value2": OwnFault(
+        f"{VALUE_2_BURST} messages about its transmit buffer, of a value that its document does not know",
+        burst=lambda device, now: device.value_2_burst(now, VALUE_2_BURST),
+    ),
+    "overrun": OwnFault("it has lost received frames", burst=lambda device, now: device.overrun(now)),
+}
 
 
 class Usb2can(Firmware):
@@ -63,6 +99,8 @@ class Usb2can(Firmware):
     power failure, or in a mode that it did not choose, before its next CONFIG_MODE counts for nothing: it
     cannot know. ValueError if the version is none.
     """
+
+    own_faults: ClassVar[Mapping[str, OwnFault]] = FAULTS
 
     def __init__(
         self,
@@ -101,6 +139,10 @@ class Usb2can(Firmware):
         if self.junk:
             self._output.append(self.junk)
         self._reckon()
+
+    @property
+    def title(self) -> str:
+        return f"USB2CAN {self.variant.version}"
 
     @property
     def record(self) -> list[str]:
@@ -315,3 +357,35 @@ class Usb2can(Firmware):
                 self._violate(f"WRITE_MESSAGE {late_s:.6f} s after a STOP")
         self._free_at = max(self._free_at, now) + self.processing_s
         self._waiting.append((self._free_at, command, data))
+
+
+# For `can-bridge simulate`
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    version = matching(r"HW\d{4}FW\d{4}", "a version like HW0003FW0016")
+    parser.add_argument(
+        "--version",
+        type=version,
+        default="HW0003FW0016",
+        dest="device_version",
+        metavar="HWxxxxFWyzzz",
+        help="answer to FW_VERSION; y: 5 and 6 stamp what they receive",
+    )
+    parser.add_argument(
+        "--tx-buffer",
+        type=whole,
+        default=20,
+        metavar="FRAMES",
+        help="room for frames to be sent; default: 20",
+    )
+
+
+def make_device(now: float, args: argparse.Namespace) -> Usb2can:
+    return Usb2can(
+        now,
+        version=args.device_version,
+        processing_s=args.processing,
+        tx_buffer=args.tx_buffer,
+        stop_grace_s=STOP_GRACE_S,
+    )

@@ -16,11 +16,10 @@ from wired import UART_RATE, in_order, wait_flowing
 
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom
-from bridged.simulators.cli import STOP_GRACE_S
 from bridged.simulators.faults import Fault
 from bridged.simulators.serve import Simulator, mixed_frames, record_line
 from bridged.simulators.uart import Uart
-from bridged.simulators.usb2can import Usb2can
+from bridged.simulators.usb2can import STOP_GRACE_S, Usb2can
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -20,8 +20,9 @@ from test_can232 import balanced
 from wired import WiredAdapter, assert_flat, in_order, numbered_frames, plugged, wait_terminal
 
 from bridged.errors import BusError
+from bridged.simulators import SIMULATORS, simulator
 from bridged.simulators.ends import CAN_FRAME, EXTENDED, open_can, unpack
-from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, Fault
+from bridged.simulators.faults import Fault, meanings
 from bridged.simulators.serve import record_line
 
 SHORT_S = 45.0  # each kind of fault about once
@@ -43,7 +44,7 @@ MARK_S = 5.0  # for a frame to come through, or another is tried
 
 INTERFACE_FAULTS = ("interface down", "interface deleted")
 OTHERS = (*INTERFACE_FAULTS, "overload")
-KINDS = {"can232": CAN232_FAULTS + OTHERS, "usb2can": USB2CAN_FAULTS + OTHERS}
+KINDS = {name: (*meanings(simulator(name).FAULTS), *OTHERS) for name in SIMULATORS}
 SERIAL_NUMBERS = {"can232": "PY000031", "usb2can": "PY000032"}
 
 # An emulated machine may be so slow that an answer counts as missing: a bridge may begin anew at any time.

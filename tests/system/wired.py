@@ -22,13 +22,12 @@ from rig import Bridge, Resources, wait_until
 from bridged.simulators import faults
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Counters, Eeprom
-from bridged.simulators.cli import STOP_GRACE_S
 from bridged.simulators.faults import BURST_S, Fault
 from bridged.simulators.serve import TRAFFIC_LATE_S, record_line
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.uart import Uart
+from bridged.simulators.usb2can import STOP_GRACE_S, Usb2can
 from bridged.simulators.usb2can import Counters as Usb2canCounters
-from bridged.simulators.usb2can import Usb2can
 
 HEARD = 0x1ABCDEF8  # identifier of `numbered_frames`
 HEARD_FPS = 50

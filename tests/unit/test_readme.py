@@ -33,7 +33,7 @@ def test_every_command_is_one() -> None:
     commands = [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("can-bridge ")]
     assert len(commands) >= 4
     for command in commands:
-        cli._parser(command[0]).parse_args(command)
+        cli._parser(command).parse_args(command)
 
 
 def test_dev_has_every_command_that_is_named() -> None:

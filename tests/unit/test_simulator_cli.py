@@ -10,7 +10,6 @@ import pytest
 from benches.simulating import START, START_ANSWER, TIMEOUT_S, ask, host, process, until
 
 from bridged import cli
-from bridged.simulators.faults import CAN232_FAULTS, MEANINGS, USB2CAN_FAULTS
 from bridged.simulators.serve import mixed_frames
 from bridged.simulators.sja1000 import Frame
 from bridged.simulators.usb2can import Usb2can
@@ -84,12 +83,3 @@ def test_arguments_that_are_no_numbers(capsys: pytest.CaptureFixture[str]):
         with pytest.raises(SystemExit):
             cli.main(arguments)
         assert text in capsys.readouterr().err
-
-
-def test_every_fault_is_explained(capsys: pytest.CaptureFixture[str]):
-    for adapter, kinds in (("can232", CAN232_FAULTS), ("usb2can", USB2CAN_FAULTS)):
-        with pytest.raises(SystemExit):
-            cli.main(["simulate", adapter, "--help"])
-        shown = "".join(capsys.readouterr().out.split())
-        for kind in kinds:
-            assert f"{kind}: {MEANINGS[kind]}".replace(" ", "") in shown

@@ -1,9 +1,7 @@
 """What befalls simulated adapters: listen-only that nobody asked for, refusals; faults on request."""
 
 import os
-import random
 
-import pytest
 from benches.can232_words import FRAME, opened
 from benches.can232_words import ask as ask_can232
 from benches.simulating import ask as ask_terminal
@@ -13,9 +11,8 @@ from benches.usb2can_words import ask as ask_usb2can
 from benches.usb2can_words import opened as opened_usb2can
 
 from bridged.simulators.can232 import Can232, State
-from bridged.simulators.faults import CAN232_FAULTS, FAULTS, Fault, begin, end, repeated
+from bridged.simulators.faults import Fault, begin, end
 from bridged.simulators.sja1000 import MOD, Sja1000
-from bridged.simulators.usb2can import Usb2can
 
 WRITE_FRAME = bytes.fromhex("0F4005022000" + "1133")
 IN_NORMAL = bytes.fromhex("0F060102")
@@ -110,15 +107,3 @@ def test_faults_are_had_on_request():
         until(lambda: isinstance(device, Can232) and not device.refuses_all)
         os.write(fd, b"C\r")
         until(lambda: device.state is State.CLOSED)
-
-
-@pytest.mark.parametrize("device", [Can232(), Usb2can()])
-def test_every_fault_of_both_comes_and_goes(device: Can232 | Usb2can):
-    for kind in FAULTS:
-        fault = Fault(kind, 0, 1)
-        assert (repeated(device, fault, random.Random(0)) is not None) == (kind == "garbage")
-        begin(device, fault, 1.0)
-        end(device, fault, 2.0)
-    assert device.powered
-    assert (device.silent, device.refusals, device.drop_answers, device.bus_off) == (False, 0, 0, False)
-    assert set(FAULTS) < set(CAN232_FAULTS)

@@ -28,8 +28,7 @@ from benches.simulating import (
 
 from bridged.errors import BusError, PortError
 from bridged.simulators.can232 import Can232
-from bridged.simulators.can232_memory import Eeprom
-from bridged.simulators.cli import load_eeprom
+from bridged.simulators.can232_memory import Eeprom, load_eeprom
 from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
 from bridged.simulators.faults import Fault, parse_fault
 from bridged.simulators.serve import CYCLIC, Simulator, cyclic_frames, mixed_frames, record_line

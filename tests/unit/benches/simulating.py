@@ -14,7 +14,7 @@ from pathlib import Path
 import bridged
 from bridged.simulators.can232 import Can232
 from bridged.simulators.device import Device
-from bridged.simulators.faults import CAN232_FAULTS, USB2CAN_FAULTS, parse_fault
+from bridged.simulators.faults import meanings, parse_fault
 from bridged.simulators.serve import Simulator
 
 TIMEOUT_S = 20
@@ -96,9 +96,10 @@ class HandClock:
 
 def by_hand(device: Device | None = None, *faults: str, **options: object) -> tuple[Simulator, HandClock]:
     clock = HandClock()
+    device = device or Can232()
     clock.simulator = Simulator(
-        device or Can232(),
-        faults=[parse_fault(text, CAN232_FAULTS + USB2CAN_FAULTS) for text in faults],
+        device,
+        faults=[parse_fault(text, meanings(device.own_faults)) for text in faults],
         clock=clock,
         **options,  # type: ignore[arg-type]
     )
