@@ -29,7 +29,7 @@ CLEAR_S = 1.0
 """A device that only tells what happened is taken for error-active when nothing has happened for so long."""
 
 LARGEST_BUFFER = 64
-"""Frames. More than a CAN232 (8) or any clone has room for."""
+"""Frames. More than any device that answers each frame has room for."""
 STALL_LOOKS = 3
 
 

@@ -124,7 +124,7 @@ class HealthPolling:
             self._look()
 
     def frame_refused(self) -> None:
-        """Asks why, at once (CAN232 manual 1.4: F after an error answer)."""
+        """Asks why, at once: a refusal itself does not say."""
         self._refused = True
         if self.next_at is not None:
             self._look()

@@ -1,6 +1,6 @@
 /* The window of a device that answers each frame.
  *
- * A refusal (CAN232: BELL) says that the device did not take the frame, so that a retry cannot put the frame on the
+ * A refusal (BELL, say) says that the device did not take the frame, so that a retry cannot put the frame on the
  * bus twice. Three exceptions: noise that looks like a refusal; a second answer to the frame before (slcanpty);
  * a resynchronisation in progress, where the refusal may mean the sync command, spliced to a broken one.
  * Hence:

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 import bridged
+from bridged.adapters import TYPES
+from bridged.simulators import SIMULATORS
 
 HOUSE = Path(bridged.__file__).parent
 # Values without a subject of their own: an error, a text fit for a terminal.
@@ -104,6 +106,32 @@ def test_no_circle() -> None:
 
     for module in graph:
         visit(module, ())
+
+
+# --- where an adapter's name may stand ---------------------------------------------------------
+
+NAMES = TYPES.keys() | SIMULATORS.keys()
+NAMING = {"adapters", "simulators"}  # the registries are in there, too
+CODECS = ("codec", "module_codecs")  # of the relay's files
+
+
+def words(tree: ast.Module) -> set[str]:
+    """All names, texts and docstrings of a module in lower case."""
+    fields = (value for node in ast.walk(tree) for _, value in ast.iter_fields(node))
+    flat = (one for value in fields for one in (value if isinstance(value, list) else [value]))
+    return {word.lower() for word in flat if isinstance(word, str)}
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if part(name) not in NAMING])
+def test_no_adapter_is_named_outside_its_rooms(module: str) -> None:
+    found = {name: word for name in NAMES for word in words(MODULES[module]) if name in word}
+    assert not found, f"bridged.{module} is for all adapters alike: what one of them is belongs to its files"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_relay_names_an_adapter_in_its_codec_only(name: str) -> None:
+    for path in HOUSE.glob("relay/*.[ch]"):
+        assert path.name.startswith(CODECS) or name not in path.read_text().lower(), path
 
 
 # --- where the tests are ----------------------------------------------------------------------
