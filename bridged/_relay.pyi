@@ -30,7 +30,7 @@ EVENT_INTERFACE_LOST: Final[int]  # token: errno, 0 for end of file
 WINDOW_MAX: Final[int]
 
 @final
-class Tally(structseq[int], tuple[int, int, int, int, int]):
+class Tally(structseq[int], tuple[int, int, int, int, int, int, int]):
     """Some of the relay's counters, under the names that counters() has."""
 
     @property
@@ -39,6 +39,10 @@ class Tally(structseq[int], tuple[int, int, int, int, int]):
     def rx_frames(self) -> int: ...
     @property
     def tx_frames(self) -> int: ...
+    @property
+    def tx_queued(self) -> int: ...
+    @property
+    def tx_unconfirmed(self) -> int: ...
     @property
     def rx_overruns(self) -> int: ...
     @property
@@ -104,6 +108,11 @@ class Relay:
         """All three anew; frames for which there is no room any more are dropped, the newest first."""
     def set_polling(self, request: bytes, prefix: bytes, interval: float, /) -> None:
         """Ask the device for frames with `request` until the port is detached."""
+    def set_sending(self, confirms: str, remote: str, /, *, window: int) -> None:
+        """How the device wants its frames until the port is detached: adapters/base.py, `Sending`.
+
+        `confirms`, `remote`: the values of Confirms and Remote. `window`: 0 for what the relay was made with.
+        """
     def set_level_window(
         self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int
     ) -> None:
@@ -128,7 +137,8 @@ class Relay:
         """A frame that came from the interface lately and one that went to it; zeros before there is one."""
 
     def counters(self) -> dict[str, int | dict[str, int]]:
-        """A snapshot between two turns: bus_read = tx_frames + queued + the sum of tx_dropped."""
+        """A snapshot between two turns: bus_read = tx_frames + tx_queued + tx_unconfirmed + queued
+        + the sum of tx_dropped."""
 
 def decode(codec: str, pieces: list[bytes], /) -> list[tuple[str, bytes, int]]:
     """The messages of a stream that arrives in these pieces: (kind, frame or text, digits or length)."""

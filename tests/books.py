@@ -13,5 +13,6 @@ def check_books(counters: Mapping[str, Any], queued: int) -> None:
     negative = {name: n for name, n in (plain | {"queued": queued} | tx | rx).items() if n < 0}
     assert not negative, negative
     read = [n for reason, n in tx.items() if reason not in LOST_BEFORE_READ]
-    assert counters["bus_read"] == counters["tx_frames"] + queued + sum(read)
+    given = counters["tx_frames"] + counters["tx_queued"] + counters["tx_unconfirmed"]
+    assert counters["bus_read"] == given + queued + sum(read)
     assert counters["decoded"] == counters["rx_frames"] + counters["rx_pending"] + sum(rx.values())

@@ -74,6 +74,38 @@ class Flow(NamedTuple):
     ready: int
 
 
+class Confirms(enum.Enum):
+    """What a device's answer to a frame means. The values are those of Relay.set_sending()."""
+
+    TAKEN = "taken"  # it is in a buffer which is emptied when the channel is closed: tx_frames
+    SENT = "sent"  # it is on the bus: tx_frames
+    QUEUED = "queued"  # it is in a buffer: tx_queued
+    ALWAYS = "always"  # nothing, the device answers also where it loses the frame: tx_unconfirmed
+    NOTHING = "nothing"  # the device answers no frame: tx_unconfirmed
+
+
+class Remote(enum.Enum):
+    """How a device wants a remote frame. The values are those of Relay.set_sending()."""
+
+    PLAIN = "plain"
+    WITH_DIGITS = "with-digits"  # with as many zeros behind it as a data frame of its DLC has digits
+    NO_STANDARD = "no-standard"  # plain; one with a standard identifier cannot be sent
+
+
+class Sending(NamedTuple):
+    """How a device wants its frames; the defaults are those of a CAN232. See Relay.set_sending()."""
+
+    confirms: Confirms = Confirms.TAKEN
+    remote: Remote = Remote.PLAIN
+    window: int | None = None  # frames and commands unanswered at once; None: as configured
+    depth: int = 1  # frames in the device's own buffer at once, with `paced_bitrate`
+    paced_bitrate: int | None = None  # bit/s: frames go no faster than a bus of this rate takes them
+    retries: bool = True  # False: a refused frame may have been on the bus, so it is not sent again
+    long_stamps: bool = False  # received frames may have time stamps of 8 digits
+    probation: int | None = None  # frames that it gets after its buffer was stuck, until one is seen to leave
+    keeps_buffer: bool = False  # closing the channel does not empty the buffer
+
+
 class Identity(NamedTuple):
     """Who the device says it is."""
 
@@ -127,6 +159,7 @@ class Adapter(Protocol):
     identity: Identity
     polling: Polling | None  # known after init_steps, as is
     flow: Flow | None  # None: the device answers each frame
+    sending: Sending  # known after init_steps
     discarded: int  # frames that it took and threw away, as far as it tells
 
     @property

@@ -23,6 +23,7 @@ from bridged.adapters.base import (
     Polling,
     PortText,
     Reply,
+    Sending,
     SerialNumber,
     Steps,
     TypeName,
@@ -218,6 +219,7 @@ class Can232:
     codec = "can232"
     flow: Flow | None = None
     discarded = 0  # it does not tell
+    sending = Sending()
 
     def __init__(self, adapter: Can232Config, channel: ChannelConfig, memory: Memory) -> None:
         self._port = adapter.port

@@ -20,6 +20,7 @@ from bridged.adapters.base import (
     Polling,
     PortText,
     Reply,
+    Sending,
     SerialNumber,
     Steps,
     TypeName,
@@ -166,6 +167,7 @@ class Usb2can:
     """Sans-I/O: what to say to a USB2CAN. `identity` and `flow` hold what init_steps found out."""
 
     codec = "usb2can"
+    sending = Sending()
     baudrate = 115_200  # of no meaning to a FT245, but a tty wants one
     answer_timeout_s = ANSWER_TIMEOUT_S
     polling: Polling | None = None

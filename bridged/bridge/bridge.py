@@ -312,6 +312,8 @@ class Bridge:
         counted = {
             "rx_frames": counters.pop("rx_frames"),
             "tx_frames": counters.pop("tx_frames"),
+            "tx_queued": counters.pop("tx_queued"),
+            "tx_unconfirmed": counters.pop("tx_unconfirmed"),
             "rx_errors": counters.pop("skipped_messages"),
             "tx_retries": counters.pop("tx_retries"),
             "reconnects": max(0, self._starts - 1),
@@ -518,6 +520,8 @@ class Bridge:
         if self.adapter.polling is not None:
             polling = self.adapter.polling
             self._relay.set_polling(polling.request, polling.prefix, polling.interval_s)
+        sending = self.adapter.sending
+        self._relay.set_sending(sending.confirms.value, sending.remote.value, window=sending.window or 0)
         if self.adapter.flow is not None:
             flow = self.adapter.flow
             self._relay.set_level_window(

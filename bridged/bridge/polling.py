@@ -81,7 +81,7 @@ class HealthPolling:
             finding = self._take(Observation("restarted", happened=Happened.RESTARTED))
         counted = self._tally()
         self._overruns_seen, self._noise_seen = counted.rx_overruns, counted.skipped_bytes
-        self._stall = Stall(self._stall.limit_s, counted.decoded, counted.tx_frames)
+        self._stall = Stall(self._stall.limit_s, counted.decoded, _taken(counted))
         self._unknown = 0
         self.next_at = now
         return finding
@@ -205,8 +205,8 @@ class HealthPolling:
         if self._unknown == UNKNOWN_LIMIT:
             return finding._replace(failure="the adapter does not answer questions about its bus")
         counted = self._tally()
-        self._sample(now, counted.rx_frames, counted.tx_frames)
-        if self._stall.observe(seen, now, counted.decoded, counted.tx_frames):
+        self._sample(now, counted.rx_frames, _taken(counted) + counted.tx_unconfirmed)
+        if self._stall.observe(seen, now, counted.decoded, _taken(counted)):
             text = f"error-passive, and nothing received for {self._stall.limit_s:g} s"
             bus_off = f"{text}: the adapter may be bus-off, or no other node acknowledges its frames"
             return finding._replace(bus_off=finding.bus_off or bus_off)
@@ -256,3 +256,8 @@ class HealthPolling:
         self._warned.well()  # what comes again is news, if it does not come all the time
         if times is not None:
             log.warning(f"{pattern}%s", text, repeated(times))
+
+
+def _taken(counted: _relay.Tally) -> int:
+    """Frames that the adapter took into its buffer, or put on its bus, by its word."""
+    return counted.tx_frames + counted.tx_queued

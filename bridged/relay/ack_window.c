@@ -13,6 +13,7 @@
 
 #define RETRY_FIRST_NS INT64_C(1000000)
 #define RETRY_LAST_NS INT64_C(16000000)
+#define COUNTER_OF_ANSWER(name, python, counter) [name] = &c->counter,
 #define RETRIES_TOLD 16 /* about four times a second */
 
 void ack_window_init(struct ack_window *w, struct queue *queue, struct line *line)
@@ -22,9 +23,18 @@ void ack_window_init(struct ack_window *w, struct queue *queue, struct line *lin
     ack_window_reset(w);
 }
 
+/* What "done" means; until the port is detached. */
+void ack_window_set(struct ack_window *w, enum answer answer)
+{
+    struct counters *c = w->queue->counters;
+    uint64_t *const counter[ANSWERS] = {ANSWER_LIST(COUNTER_OF_ANSWER)};
+    w->taken = counter[answer];
+}
+
 /* The port is gone or new. */
 void ack_window_reset(struct ack_window *w)
 {
+    ack_window_set(w, ANSWER_TAKEN);
     w->checking = false;
     w->retry_delay_ns = RETRY_FIRST_NS;
     w->retry_at_ns = 0;
@@ -66,7 +76,7 @@ void ack_window_synced(struct ack_window *w)
 void ack_window_confirmed(struct ack_window *w, uint64_t number)
 {
     struct queue *q = w->queue;
-    q->counters->confirmed++;
+    ++*w->taken;
     w->retry_delay_ns = RETRY_FIRST_NS;
     w->refused_ns = NEVER;
     while (q->retry_count && queue_retry_first(q)->number < number) {

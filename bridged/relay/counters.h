@@ -29,6 +29,20 @@
     X(RX_INTERFACE_DOWN, "bus-down", "the interface is down (ENETDOWN)") \
     X(RX_INTERFACE_LOST, "bus-lost", "the interface is gone, or none is attached")
 
+/* What a device says by its answer to a frame, and the counter for that. */
+#define ANSWER_LIST(X) \
+    X(ANSWER_TAKEN, "taken", confirmed) /* it is in a buffer which is emptied when the channel is closed */ \
+    X(ANSWER_SENT, "sent", confirmed) /* it is on the bus */ \
+    X(ANSWER_QUEUED, "queued", buffered) /* it is in a buffer */ \
+    X(ANSWER_ALWAYS, "always", unconfirmed) /* nothing: the device answers also where the frame is lost */ \
+    X(ANSWER_NONE, "nothing", unconfirmed) /* the device answers no frame */
+
+/* How a remote frame is said. */
+#define REMOTE_LIST(X) \
+    X(REMOTE_PLAIN, "plain") \
+    X(REMOTE_WITH_DIGITS, "with-digits") /* with as many zeros behind it as a data frame of its DLC has digits */ \
+    X(REMOTE_NO_STANDARD, "no-standard") /* plain; one with a standard identifier cannot be sent */
+
 /* The kinds of event that events() returns. The name in Python is that of the enumerator. */
 #define EVENT_LIST(X) \
     X(EVENT_OK, "a command was answered \"done\"") \
@@ -49,7 +63,9 @@
 /* Each is a field of struct counters. */
 #define COUNTER_LIST(X) \
     X(interface_read, "bus_read", "frames read from the interface") \
-    X(confirmed, "tx_frames", "frames that the adapter took") \
+    X(confirmed, "tx_frames", "frames that the adapter put on its bus, or into a buffer that closing empties") \
+    X(buffered, "tx_queued", "frames that are in the adapter's buffer, or were: it does not tell") \
+    X(unconfirmed, "tx_unconfirmed", "frames given to an adapter that says nothing of what became of them") \
     X(retries, "tx_retries", "frames sent once more after a refusal") \
     X(returned, "tx_returned", "frames that the adapter handed back") \
     X(stops, "tx_stops", "how often the adapter said that its transmit buffer is nearly full") \
@@ -70,6 +86,8 @@
 enum tx_drop { TX_DROP_LIST(LIST_NAME) TX_DROPS };
 enum rx_drop { RX_DROP_LIST(LIST_NAME) RX_DROPS };
 enum event_kind { EVENT_LIST(LIST_NAME) EVENT_KINDS };
+enum answer { ANSWER_LIST(LIST_NAME) ANSWERS };
+enum remote { REMOTE_LIST(LIST_NAME) REMOTES };
 
 struct counters {
     COUNTER_LIST(LIST_FIELD)

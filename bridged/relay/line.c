@@ -18,7 +18,7 @@ void line_init(struct line *l, const struct settings *set, struct counters *coun
     l->codec = set->codec;
     l->sync = set->sync;
     l->answer_timeout_ns = set->answer_timeout_ns;
-    l->window = set->window;
+    l->window = l->usual_window = set->window;
     l->out_until_ns = NEVER;
 }
 
@@ -41,9 +41,16 @@ static void out_cut(struct line *l)
     l->out_until_ns = NEVER;
 }
 
+/* How the device wants its frames; until the port is detached. */
+void line_set(struct line *l, const struct sending_settings *set)
+{
+    l->window = set->window ? set->window : l->usual_window;
+}
+
 /* The port is gone or new. The caller has taken everything out of flight before. */
 void line_reset(struct line *l)
 {
+    l->window = l->usual_window;
     out_cut(l);
     l->resyncing = l->silent = false;
 }

@@ -42,7 +42,7 @@ struct line {
     const struct codec *codec;
     struct command sync;
     int64_t answer_timeout_ns;
-    uint32_t window;
+    uint32_t window, usual_window;
     uint8_t out[OUT_BUFFER];
     size_t out_start, out_end;
     int64_t out_until_ns; /* what is in `out` must be gone by then */
@@ -54,6 +54,7 @@ struct line {
 };
 
 void line_init(struct line *l, const struct settings *set, struct counters *counters, struct events *events);
+void line_set(struct line *l, const struct sending_settings *set);
 void line_reset(struct line *l);
 void line_forget(struct line *l);
 struct cut line_cut(const struct line *l);

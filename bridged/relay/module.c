@@ -27,6 +27,10 @@ static const struct {
 enum { EVENTS_BATCH = 32 }; /* taken at once, with the lock */
 static_assert(EVENTS_MAX % EVENTS_BATCH == 0, "events() returns EVENTS_MAX at most");
 
+#define NAME_IN_PYTHON(name, python, ...) python,
+static const char *const ANSWER_NAMES[] = {ANSWER_LIST(NAME_IN_PYTHON)};
+static const char *const REMOTE_NAMES[] = {REMOTE_LIST(NAME_IN_PYTHON)};
+
 struct module_state {
     PyTypeObject *tally_type;
 };
@@ -341,6 +345,38 @@ static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
     Py_RETURN_NONE;
 }
 
+/* The place of `name` in the list, or -1 with ValueError. */
+static int name_find(const char *const *list, int n, const char *what, const char *name)
+{
+    for (int i = 0; i < n; i++)
+        if (strcmp(list[i], name) == 0)
+            return i;
+    PyErr_Format(PyExc_ValueError, "no %s is named '%s'", what, name);
+    return -1;
+}
+
+static PyObject *Relay_set_sending(PyObject *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"", "", "window", NULL};
+    struct sending_settings set = {0};
+    const char *answer_name, *remote_name;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "ss$O&:set_sending", names, &answer_name, &remote_name,
+                                     uint32_from, &set.window))
+        return NULL;
+    int answer = name_find(ANSWER_NAMES, ANSWERS, "confirmation", answer_name);
+    int remote = answer < 0 ? -1 : name_find(REMOTE_NAMES, REMOTES, "way to send remote frames", remote_name);
+    if (remote < 0)
+        return NULL;
+    if (set.window > WINDOW_MAX) {
+        PyErr_Format(PyExc_ValueError, "window is 1 to %d, or 0 for what the relay was made with", WINDOW_MAX);
+        return NULL;
+    }
+    set.answer = (enum answer)answer;
+    set.remote = (enum remote)remote;
+    relay_set_sending(self_relay(self), &set);
+    Py_RETURN_NONE;
+}
+
 static PyObject *Relay_set_level_window(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"ask", "prefix", "capacity", "critical", "ready", NULL};
@@ -461,6 +497,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"set_gates", (PyCFunction)(void (*)(void))Relay_set_gates, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_queue", Relay_set_queue, METH_VARARGS, NULL},
     {"set_polling", Relay_set_polling, METH_VARARGS, NULL},
+    {"set_sending", (PyCFunction)(void (*)(void))Relay_set_sending, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_level_window", (PyCFunction)(void (*)(void))Relay_set_level_window, METH_VARARGS | METH_KEYWORDS, NULL},
     {"command", (PyCFunction)(void (*)(void))Relay_command, METH_VARARGS | METH_KEYWORDS, NULL},
     {"events", Relay_events, METH_NOARGS, NULL},

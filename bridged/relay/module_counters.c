@@ -60,6 +60,8 @@ static const struct {
     {"decoded", offsetof(struct counters, decoded)},
     {"rx_frames", offsetof(struct counters, delivered)},
     {"tx_frames", offsetof(struct counters, confirmed)},
+    {"tx_queued", offsetof(struct counters, buffered)},
+    {"tx_unconfirmed", offsetof(struct counters, unconfirmed)},
     {"rx_overruns", offsetof(struct counters, overruns)},
     {"skipped_bytes", offsetof(struct counters, skipped_bytes)},
 };

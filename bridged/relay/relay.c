@@ -299,6 +299,13 @@ void relay_set_polling(struct relay *r, const struct command *poll, int64_t inte
     unlock_wake(r);
 }
 
+void relay_set_sending(struct relay *r, const struct sending_settings *set)
+{
+    lock(r);
+    transmit_set_sending(&r->transmit, set);
+    unlock_wake(r);
+}
+
 void relay_set_level_window(struct relay *r, const struct level_settings *set)
 {
     lock(r);

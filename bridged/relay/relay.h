@@ -3,7 +3,7 @@
  * One thread runs relay_run(); any other may call the functions below meanwhile. Each sees the relay between two
  * turns of the loop, so that the counters of a snapshot add up:
  *
- *   frames read from the interface = confirmed + dropped (by reason) + queued
+ *   frames read from the interface = confirmed + buffered + unconfirmed + dropped (by reason) + queued
  *   frames decoded from the port = put on the interface + dropped (by reason) + pending
  *
  * Each part of the relay has its own files and owns its struct; their includes go one way:
@@ -45,6 +45,7 @@ void relay_hold_interface(struct relay *r, bool held);
 void relay_set_gates(struct relay *r, bool receiving, enum gate gate);
 int relay_set_queue(struct relay *r, const struct queue_settings *set); /* -> 0 or ENOMEM */
 void relay_set_polling(struct relay *r, const struct command *poll, int64_t interval_ns);
+void relay_set_sending(struct relay *r, const struct sending_settings *set);
 void relay_set_level_window(struct relay *r, const struct level_settings *set);
 void relay_command(struct relay *r, const struct command *command, bool more);
 

@@ -175,6 +175,13 @@ bool transmit_command(struct transmit *t, const struct command *command)
     return true;
 }
 
+/* How the device wants its frames; until the port is detached. */
+void transmit_set_sending(struct transmit *t, const struct sending_settings *set)
+{
+    line_set(t->line, set);
+    ack_window_set(t->ack, set->answer);
+}
+
 void transmit_poll(struct transmit *t, const struct command *poll, int64_t interval_ns)
 {
     t->poll = *poll;

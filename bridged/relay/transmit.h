@@ -30,6 +30,7 @@ void transmit_init(struct transmit *t, struct queue *queue, struct line *line, s
 void transmit_reset(struct transmit *t);
 void transmit_forget(struct transmit *t);
 bool transmit_command(struct transmit *t, const struct command *command);
+void transmit_set_sending(struct transmit *t, const struct sending_settings *set);
 void transmit_poll(struct transmit *t, const struct command *poll, int64_t interval_ns);
 int transmit_last_words(struct transmit *t, int port, const uint8_t *words, size_t length);
 void transmit_answer(struct transmit *t, const struct codec_message *msg, const struct can_frame *frame, int64_t now);

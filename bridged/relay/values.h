@@ -6,6 +6,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "counters.h"
+
 /* Times are nanoseconds on the relay's clock, see clock.h. */
 #define NS_PER_S INT64_C(1000000000)
 #define NEVER INT64_MAX
@@ -47,6 +49,13 @@ struct settings {
     uint32_t window;
     int64_t answer_timeout_ns; /* of a frame, a poll, a sync command */
     struct command sync;       /* a command with an answer that nothing else gives */
+};
+
+/* How a device wants its frames. */
+struct sending_settings {
+    enum answer answer;
+    enum remote remote;
+    uint32_t window; /* frames and commands unanswered; 0: settings.window */
 };
 
 struct level_settings {

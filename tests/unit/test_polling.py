@@ -48,7 +48,15 @@ class Bench:
         self.told: list[bytes] = []
         self.failed: list[str] = []
         self.off: list[str] = []
-        names = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
+        names = (
+            "decoded",
+            "rx_frames",
+            "tx_frames",
+            "tx_queued",
+            "tx_unconfirmed",
+            "rx_overruns",
+            "skipped_bytes",
+        )
         self.counters = dict.fromkeys(names, 0)
         self.polling = HealthPolling(
             self.adapter,  # type: ignore[arg-type]

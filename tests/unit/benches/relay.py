@@ -82,7 +82,15 @@ class Rig:
         c: dict[str, Any] = self.relay.counters()
         check_books(c, c["queued"])
         tx, rx = c.pop("tx_dropped"), c.pop("rx_dropped")
-        looked_at = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
+        looked_at = (
+            "decoded",
+            "rx_frames",
+            "tx_frames",
+            "tx_queued",
+            "tx_unconfirmed",
+            "rx_overruns",
+            "skipped_bytes",
+        )
         tally = self.relay.tally()
         assert [getattr(tally, name) for name in looked_at] == [c[name] for name in looked_at]
         return {**c, **tx, **{f"rx {k}": v for k, v in rx.items()}}  # type: ignore[dict-item]

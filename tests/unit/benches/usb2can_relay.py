@@ -200,7 +200,15 @@ class Rig:
         check_books(c, c["queued"])
         tx = c.pop("tx_dropped")
         del c["rx_dropped"]
-        looked_at = ("decoded", "rx_frames", "tx_frames", "rx_overruns", "skipped_bytes")
+        looked_at = (
+            "decoded",
+            "rx_frames",
+            "tx_frames",
+            "tx_queued",
+            "tx_unconfirmed",
+            "rx_overruns",
+            "skipped_bytes",
+        )
         tally = self.relay.tally()
         assert [getattr(tally, name) for name in looked_at] == [c[name] for name in looked_at]
         return {**c, **tx, "tx_dropped": sum(tx.values())}  # type: ignore[dict-item]
