@@ -81,11 +81,13 @@ def _run(args: argparse.Namespace) -> int:
     _import_msgspec()
 
     from bridged.bridge.bridge import Bridge  # noqa: PLC0415
-    from bridged.daemon.eeprom_store import FileMemory, state_directory  # noqa: PLC0415
+    from bridged.daemon.directories import state_directory  # noqa: PLC0415
+    from bridged.daemon.eeprom_store import FileMemory  # noqa: PLC0415
     from bridged.daemon.journal import start_logging  # noqa: PLC0415
     from bridged.daemon.notify import systemd_notifier  # noqa: PLC0415
     from bridged.daemon.service import Service, hangup_means_reload  # noqa: PLC0415
-    from bridged.daemon.status import StatusServer, farewell, own_socket_path  # noqa: PLC0415
+    from bridged.daemon.status import StatusServer, own_socket_path  # noqa: PLC0415
+    from bridged.daemon.status_text import farewell  # noqa: PLC0415
 
     config = _load(args.config)
     notifier = systemd_notifier()
@@ -187,7 +189,8 @@ def _ask(args: argparse.Namespace) -> tuple[str, bool]:
     """What to show, and whether all bridges that were asked run."""
     import json  # noqa: PLC0415
 
-    from bridged.daemon.status import NotRunningError, StatusError, is_running, query, render, render_short  # noqa: PLC0415
+    from bridged.daemon.status import NotRunningError, StatusError, is_running, query  # noqa: PLC0415
+    from bridged.daemon.status_text import render, render_short  # noqa: PLC0415
 
     paths = _status_paths(args)
     if len(paths) == 1:

@@ -9,32 +9,18 @@ import contextlib
 import logging
 import os
 import stat
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridged.daemon.status import OTHERS_WRITE, runtime_directory
+from bridged.daemon.directories import OTHERS_WRITE
 from bridged.text import user_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 log = logging.getLogger(__name__)
 
 FILE_MAX = 1 << 16  # bytes
-
-
-def state_directory() -> Path:
-    """systemd's StateDirectory, else /var/lib for root, else XDG_STATE_HOME (basedir specification)."""
-    if given := os.environ.get("STATE_DIRECTORY"):
-        return Path(given.split(":", maxsplit=1)[0])
-    if os.geteuid() == 0:
-        return Path("/var/lib/can-bridge")
-    if home := os.environ.get("XDG_STATE_HOME"):
-        return Path(home) / "can-bridge"
-    try:
-        return Path("~/.local/state/can-bridge").expanduser()
-    except RuntimeError:  # a user without a home
-        return runtime_directory()
 
 
 class FileMemory:

@@ -26,20 +26,18 @@ import os
 import socket
 import stat
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bridged.daemon import directories
 from bridged.errors import BridgeError
-from bridged.text import printable, user_name
+from bridged.text import user_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
 ANSWER_TIMEOUT_S = 5.0
 ANSWER_MAX = 1 << 20
-SYSTEM_DIRECTORY = Path("/run/can-bridge")
-FALLBACK_DIRECTORY = "/tmp/can-bridge-{uid}"  # without XDG_RUNTIME_DIR: su, cron, containers
-OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 GROUP = "can-bridge"  # systemd/can-bridge.sysusers
 
 
@@ -55,49 +53,26 @@ class NotRunningError(NoAnswerError):
     """There is none."""
 
 
-def runtime_directory() -> Path:
-    """Where the status sockets of this user's bridges are: /run/can-bridge for root."""
-    if os.geteuid() == 0:
-        return SYSTEM_DIRECTORY
-    if base := os.environ.get("XDG_RUNTIME_DIR"):
-        return Path(base) / "can-bridge"
-    return Path(FALLBACK_DIRECTORY.format(uid=os.geteuid()))
-
-
 def own_socket_path(name: str) -> Path:
     """Where this user's bridge `name` makes its status socket; the directory is made if it is missing.
 
     StatusError: somebody else owns the directory or may write in it (anybody can make the one in /tmp first),
     and could put another socket in the place of ours.
     """
-    directory = runtime_directory()
+    directory = directories.runtime_directory()
     try:
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         found = directory.lstat()
     except OSError as error:
         raise StatusError(_cannot_make(directory / f"{name}.sock", error)) from error
-    if distrust := _distrust(found):
+    if distrust := directories.distrust(found):
         raise StatusError(f"{directory} {distrust}: set XDG_RUNTIME_DIR, or give --socket PATH")
     return directory / f"{name}.sock"
 
 
-def _distrust(directory: os.stat_result) -> str:
-    """Why our sockets must not be in the directory; empty: they may."""
-    if os.geteuid() == 0:  # it is in /run, where only root may write
-        return ""
-    if not stat.S_ISDIR(directory.st_mode):
-        return "is no directory"
-    if directory.st_uid != os.geteuid():
-        return f"belongs to {user_name(directory.st_uid)}"
-    return "is one that other users may write in" if directory.st_mode & OTHERS_WRITE else ""
-
-
 def running_sockets() -> list[Path]:
     """The status sockets there are, of this user's bridges and of root's."""
-    folders = {SYSTEM_DIRECTORY}
-    with contextlib.suppress(OSError):
-        if not _distrust(runtime_directory().lstat()):
-            folders.add(runtime_directory())
+    folders = directories.runtime_directories()
     return sorted(path for folder in folders for path in folder.glob("*.sock"))
 
 
@@ -264,7 +239,7 @@ def _who_may(path: Path) -> str:
     advice = (
         "ask as root (sudo)" if found.st_uid == 0 else f"ask as {user_name(found.st_uid)} or as root (sudo)"
     )
-    if path.parent == SYSTEM_DIRECTORY:
+    if path.parent == directories.SYSTEM_RUNTIME:
         advice += f"; to do without, install systemd/can-bridge.sysusers and join group {GROUP}"
     return f"it is the bridge of {user_name(found.st_uid)}: {advice}"
 
@@ -279,106 +254,3 @@ def is_running(status: dict[str, Any]) -> bool:
     """Whether frames go between the adapter and an open interface."""
     bus = status.get("bus")
     return status.get("state") == "running" and isinstance(bus, dict) and bool(bus.get("open"))
-
-
-def render(status: dict[str, Any]) -> str:
-    """The status for a human; the state is in the first line, for small terminals."""
-    return _written(_lines, status)
-
-
-def render_short(status: dict[str, Any]) -> str:
-    """The status in one line."""
-    return _written(_short, status)
-
-
-def farewell(status: dict[str, Any]) -> str:
-    """What a bridge has done, for the last line of its log."""
-    return _written(_farewell, status)
-
-
-def _written(write: Callable[[dict[str, Any]], list[str]], status: dict[str, Any]) -> str:
-    """As one writes it, without what moves a terminal's cursor."""
-    try:
-        lines = write(status)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        msg = "the bridge that answers is of another version of can-bridge: restart it, or use --json"
-        raise StatusError(msg) from error
-    return "\n".join(printable(line) for line in lines)
-
-
-def _headline(status: dict[str, Any]) -> str:
-    return f"{status['name']}: {status['state']}, up {_duration(status['uptime_s'])}"
-
-
-def _lines(status: dict[str, Any]) -> list[str]:
-    adapter, counters, bus, rates = status["adapter"], status["counters"], status["bus"], status["rates"]
-    identity = f"version {adapter['version'] or '?'}, serial number {adapter['serial_number'] or '?'}"
-    parts = {
-        "adapter": f"{adapter['type']} on {adapter['port']}, {identity}",
-        "CAN bus": _bus_state(status),
-        "interface": f"{bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
-        "received": (
-            f"{counters['rx_frames']} frames from the adapter, {rates['rx_fps']:.0f}/s, "
-            f"{counters['rx_errors']} line errors, {counters['rx_overruns']} adapter overruns"
-        ),
-        "rx dropped": _reasons(counters["rx_dropped"]) or "none",
-        "sent": (
-            f"{counters['tx_frames']} frames to the adapter, {rates['tx_fps']:.0f}/s, "
-            f"{counters['tx_retries']} retries, {status['queued']} queued"
-        ),
-        "tx dropped": _reasons(counters["tx_dropped"]) or "none",
-        "can-bridge": f"version {status['version']}",
-    }
-    if status["reason"]:
-        parts = {"reason": status["reason"], **parts}
-    return [_headline(status), *(f"  {name:<10}  {text}" for name, text in parts.items())]
-
-
-def _short(status: dict[str, Any]) -> list[str]:
-    counters = status["counters"]
-    dropped = sum(counters["rx_dropped"].values()) + sum(counters["tx_dropped"].values())
-    reason = f" ({status['reason']})" if status["reason"] else ""
-    return [
-        f"{_headline(status)}, {counters['rx_frames']} frames received, {counters['tx_frames']} sent, "
-        f"{dropped} dropped{reason}"
-    ]
-
-
-def _farewell(status: dict[str, Any]) -> list[str]:
-    counters = status["counters"]
-    rx, tx = _reasons(counters["rx_dropped"]), _reasons(counters["tx_dropped"])
-    dropped = "; ".join([f"rx dropped: {rx}"] * bool(rx) + [f"tx dropped: {tx}"] * bool(tx))
-    channel = {
-        None: "no adapter was reached",
-        False: "the adapter's channel is closed",
-        True: "the adapter's channel may still be open",
-    }
-    return [
-        f"stopped after {_duration(status['uptime_s'])}: {counters['rx_frames']} frames received, "
-        f"{counters['tx_frames']} sent; {dropped or 'none dropped'}; {channel[status['channel_open']]}"
-    ]
-
-
-def _reasons(dropped: dict[str, int]) -> str:
-    return ", ".join(f"{reason} {n}" for reason, n in dropped.items() if n)
-
-
-def _bus_state(status: dict[str, Any]) -> str:
-    if status["bus_state"] is None:
-        return "not known"
-    counters = "" if status["tec"] is None else f", TEC {status['tec']}, REC {status['rec']}"
-    times = status["answer_time_ms"]
-    answers = f", answers in {times['median']:.1f} ms" if times else ""
-    return f"{status['bus_state']}{counters}{answers}"
-
-
-def _duration(seconds: float) -> str:
-    """Its two largest units: `3 d 4 h`."""
-    minutes, left = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    days, hours = divmod(hours, 24)
-    if days:
-        return f"{days} d {hours} h"
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {left} s" if minutes else f"{left} s"

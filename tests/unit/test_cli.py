@@ -15,7 +15,7 @@ import pytest
 from benches.status_socket import serving, snapshot
 
 from bridged import VERSION, cli
-from bridged.daemon import status
+from bridged.daemon import directories, status_text
 
 CONFIG = """\
 adapter: {type: can232, port: /nowhere/tty, baudrate: 115200}
@@ -27,7 +27,7 @@ bus: {interface: virtual, channel: a}
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The directory of the status sockets, of root's bridges and ours."""
-    monkeypatch.setattr(status, "SYSTEM_DIRECTORY", tmp_path)
+    monkeypatch.setattr(directories, "SYSTEM_RUNTIME", tmp_path)
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     return tmp_path
 
@@ -52,7 +52,7 @@ class TestStatus:
         with serving(run / "can232.sock", snapshot()):
             assert cli.main(["status"]) == 0
             text = capsys.readouterr().out
-            assert text == f"{status.render(snapshot())}\n"
+            assert text == f"{status_text.render(snapshot())}\n"
             assert cli.main(["status", "can232"]) == 0
             assert capsys.readouterr().out == text
             assert cli.main(["status", "--json"]) == 0
@@ -158,7 +158,7 @@ class TestStatus:
     def test_a_small_terminal_shows_the_head(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(os, "get_terminal_size", lambda _fd: os.terminal_size((20, 4)))
         monkeypatch.setattr(sys.stdout, "fileno", lambda: 1, raising=False)
-        text = cli._fitted(status.render(snapshot(state="waiting", reason="there is no tty")))
+        text = cli._fitted(status_text.render(snapshot(state="waiting", reason="there is no tty")))
         assert text.splitlines() == ["can232: waiting, up ", "9 s", "  reason      there "]
 
 

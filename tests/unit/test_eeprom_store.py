@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from bridged.daemon import eeprom_store as memory
 from bridged.daemon.eeprom_store import FileMemory
 
 SERIAL = "A123"
@@ -120,14 +119,3 @@ def test_it_is_on_the_disk_before_it_takes_the_place_of_the_old_one(
     )
     FileMemory(directory).remember(SERIAL, "W", 1)
     assert done == ["fsync", "replace"]
-
-
-def test_where(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")
-    assert memory.state_directory() == Path("/var/lib/a")
-    monkeypatch.delenv("STATE_DIRECTORY")
-    monkeypatch.setattr(os, "geteuid", lambda: 0)
-    assert memory.state_directory() == Path("/var/lib/can-bridge")
-    monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    monkeypatch.setenv("XDG_STATE_HOME", "/home/a/state")
-    assert memory.state_directory() == Path("/home/a/state/can-bridge")

@@ -11,16 +11,9 @@ from typing import Any
 import pytest
 from benches.status_socket import listening, serving, snapshot
 
-from bridged.daemon import status
-from bridged.daemon.status import (
-    NoAnswerError,
-    StatusError,
-    StatusServer,
-    farewell,
-    own_socket_path,
-    query,
-    render,
-)
+from bridged.daemon import directories, status, status_text
+from bridged.daemon.status import NoAnswerError, StatusError, StatusServer, own_socket_path, query
+from bridged.daemon.status_text import farewell, render
 
 GROUP = 12345
 
@@ -100,7 +93,7 @@ class TestDirectory:
     def fallback(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         """The directory of a user without XDG_RUNTIME_DIR."""
         monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-        monkeypatch.setattr(status, "FALLBACK_DIRECTORY", f"{tmp_path}/can-bridge-{{uid}}")
+        monkeypatch.setattr(directories, "FALLBACK_RUNTIME", f"{tmp_path}/can-bridge-{{uid}}")
         uid = os.geteuid() or GROUP
         monkeypatch.setattr(os, "geteuid", lambda: uid)
         return tmp_path / f"can-bridge-{uid}"
@@ -118,7 +111,7 @@ class TestDirectory:
         fallback.mkdir()
         owner = fallback.stat().st_uid
         monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
-        monkeypatch.setattr(status, "FALLBACK_DIRECTORY", str(fallback))
+        monkeypatch.setattr(directories, "FALLBACK_RUNTIME", str(fallback))
         with pytest.raises(StatusError, match=rf"{fallback} belongs to .*XDG_RUNTIME_DIR"):
             own_socket_path("a")
 
@@ -267,4 +260,4 @@ class TestText:
 
     def test_durations(self) -> None:
         times = {59.9: "59 s", 61: "1 min 1 s", 3600: "1 h 0 min", 8_640_000 + 7200: "100 d 2 h"}
-        assert {seconds: status._duration(seconds) for seconds in times} == times
+        assert {seconds: status_text._duration(seconds) for seconds in times} == times

@@ -1,0 +1,40 @@
+"""Where the files of a bridge are, for root, a service, and other users."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from bridged.daemon import directories
+
+
+def test_where_the_status_sockets_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    user = os.geteuid() or 1000
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert directories.runtime_directory() == Path("/run/can-bridge")
+    assert directories.runtime_directories() == {Path("/run/can-bridge")}
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own = tmp_path / "can-bridge"
+    assert directories.runtime_directory() == own
+    assert directories.runtime_directories() == {Path("/run/can-bridge")}  # it does not exist
+    own.mkdir(mode=0o755)
+    os.chown(own, user, -1)
+    assert directories.runtime_directories() == {Path("/run/can-bridge"), own}
+    own.chmod(0o777)
+    assert directories.runtime_directories() == {Path("/run/can-bridge")}
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert directories.runtime_directory() == Path(f"/tmp/can-bridge-{user}")
+
+
+def test_where_the_state_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")
+    assert directories.state_directory() == Path("/var/lib/a")
+    monkeypatch.delenv("STATE_DIRECTORY")
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert directories.state_directory() == Path("/var/lib/can-bridge")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setenv("XDG_STATE_HOME", "/home/a/state")
+    assert directories.state_directory() == Path("/home/a/state/can-bridge")
