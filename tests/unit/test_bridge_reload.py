@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from benches.bridge import FRAME, Bench, Usb2canBench, run_until, started, stopped
+from benches.bridge import FRAME, Bench, PairBus, Usb2canBench, run_until, started, stopped
 from books import check_books
 
 from bridged.bridge.bridge import Bridge
@@ -149,3 +149,15 @@ def test_frames_of_the_adapter_go_on_while_its_channel_is_closed(bench: Bench) -
     assert old.snapshot()["counters"]["rx_dropped"]["bus-lost"] == 0
     new.start(old)
     stopped(new)
+
+
+def test_an_interface_that_is_lost_while_it_is_handed_over_is_opened_again(bench: Bench) -> None:
+    new = handed_over(bench, old := started(bench.bridge()))
+    bench.bus.far.close()
+    lost, bench.bus = bench.bus, PairBus()
+    new.start(old)
+    run_until(new, lambda: new.state is State.RUNNING and new.snapshot()["bus"]["up"])
+    bench.bus.far.send(FRAME.pack(1, 0, b""))
+    run_until(new, lambda: bench.frames)
+    stopped(new)
+    lost.close()

@@ -25,3 +25,11 @@ def test_a_stop_does_not_need_an_answer(bench: Bench) -> None:
     bench.device.silent = True
     assert stopped(bridge)["channel_open"]  # for all that is known
     assert bridge.reason == ""
+
+
+def test_frames_of_the_adapter_go_on_until_its_channel_is_closed(bench: Bench) -> None:
+    """Before that it is given time to send what it has taken: 80 ms here."""
+    bench.plug_in(Can232(time.monotonic()), traffic_fps=500)
+    bridge = started(bench.bridge("bitrate: 50000"))
+    bench.bus.far.recv(16)
+    assert stopped(bridge)["counters"]["rx_dropped"]["not-running"] == 0

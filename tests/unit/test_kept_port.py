@@ -4,6 +4,8 @@ import contextlib
 import logging
 import socket
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from benches.usb2can_relay import Rig, S, numbered, packed, rig_with
@@ -210,6 +212,24 @@ def test_another_bridge_takes_it_over(caplog: pytest.LogCaptureFixture) -> None:
         assert bridge.tries()
         bridge.goes_on()
         assert bridge.openings == 0
+
+
+def test_another_bridge_sends_the_rest_of_a_frame_that_the_port_took_a_part_of() -> None:
+    """Its relay is another, which knows nothing of that frame but what it is told."""
+    resumed: list[tuple[object, ...]] = []
+    cut: Any = SimpleNamespace(cut=lambda: (True, b"a message", 3))
+    other_relay: Any = SimpleNamespace(resume=lambda *rest: resumed.append(rest))
+    near, far = socket.socketpair()
+    with near, far:
+        port: Any = SimpleNamespace(fd=near.fileno())
+        kept = KeptPort(cut)
+        kept.release(port)
+        other = KeptPort(other_relay)
+        other.adopt(kept)
+        assert kept.take() is None
+        assert other.take() is port
+        other.resume()
+    assert resumed == [(b"a message", 3)]
 
 
 @pytest.mark.parametrize("ends", [socket.socket.close, lambda far: far.shutdown(socket.SHUT_RDWR)])

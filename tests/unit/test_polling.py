@@ -116,6 +116,20 @@ def test_answers_of_a_round_that_is_over_mean_nothing() -> None:
     assert bench.polling.health.state is BusState.ERROR_ACTIVE
 
 
+def test_a_refusal_before_a_new_start_is_not_told_after_it(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    bench.polling.frame_refused()
+    bench.polling.stop()
+    bench.asked.clear()
+    bench.polling.start(0.0)
+    bench.look()
+    assert caplog.messages == []
+    bench.polling.frame_refused()
+    bench.answer()
+    bench.answer()
+    assert caplog.messages == ["adapter refuses frames; its status: good"]
+
+
 def test_answers_older_than_what_the_adapter_says_by_itself_are_not_believed() -> None:
     bench = Bench()
     bench.answer()

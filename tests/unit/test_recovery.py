@@ -179,6 +179,23 @@ def test_a_usb2can_is_taken_off_the_bus_if_it_is_not_to_restart_itself(
     stopped(bridge)
 
 
+@pytest.mark.parametrize(("restart", "state"), [("never", State.BUS_OFF), ("50", State.BACKOFF)])
+def test_another_restart_that_is_reloaded_counts_for_a_bus_off_that_lasts(
+    usb2can: Usb2canBench, restart: str, state: State
+) -> None:
+    device = usb2can.device_plugged_in()
+    bridge = started(usb2can.bridge())
+    device.set_bus_off(time.monotonic(), True)
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.BUS_OFF.text)
+    assert bridge.state is State.RUNNING
+    other = usb2can.bridge(f"bitrate: 500000, restart: {restart}")
+    assert bridge.adopt(other.config)
+    other.close()
+    run_until(bridge, lambda: bridge.state is state)
+    assert device.chip.in_reset
+    stopped(bridge)
+
+
 def test_an_adapter_that_does_not_answer_cannot_delay_the_end(
     can232: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -263,6 +280,22 @@ def test_a_stop_does_not_wait_for_an_error_passive_adapter(
     run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-passive")
     stopped(bridge)
     assert closings.drains == [False]
+
+
+@pytest.mark.parametrize(
+    ("restart_s", "verdict"),
+    [
+        (0.0, None),
+        (2.5, (Event.SILENT, 2.5, True)),  # the pause is that of the configuration, not the back-off's
+        (None, (Event.BUS_OFF, None, True)),
+    ],
+)
+def test_what_bus_off_leads_to(restart_s: float | None, verdict: tuple[object, ...] | None) -> None:
+    bus = SimpleNamespace(interface="socketcan", channel="vcan0")
+    config: Any = SimpleNamespace(channel=SimpleNamespace(restart_s=restart_s), bus=bus)
+    found = Recovery(config, cast("Any", None)).off("bus-off")
+    assert (found and (found.event, found.pause_s, found.off_bus)) == verdict
+    assert found is None or found.reason.startswith("bus-off; ")
 
 
 def test_frames_that_were_thrown_away_are_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
