@@ -20,8 +20,8 @@ def chance() -> float:
 class Backoff:
     """Seconds until the next try: doubling from `initial_s` to `maximum_s`, each with jitter.
 
-    They are short again after hurry(), and after the adapter ran for STABLE_S: running for a moment only
-    is no reason to hurry. `random` gives 0 to 1; `now` is any clock in seconds.
+    They are short again after reset(), and after the adapter ran for STABLE_S: running for a moment only
+    does not shorten them. `random` gives 0 to 1; `now` is any clock in seconds.
     """
 
     def __init__(self, initial_s: float, maximum_s: float, random: Callable[[], float]) -> None:
@@ -31,10 +31,10 @@ class Backoff:
         self._next_s = initial_s
         self._running_since: float | None = None
 
-    def adopt(self, initial_s: float, maximum_s: float) -> None:
+    def reconfigure(self, initial_s: float, maximum_s: float) -> None:
         """Other settings, and short pauses again."""
         self._initial_s, self._maximum_s = initial_s, maximum_s
-        self.hurry()
+        self.reset()
 
     def runs(self, now: float) -> None:
         """The adapter runs, until next_s() or longest_s() is called."""
@@ -46,7 +46,7 @@ class Backoff:
 
     def next_s(self, now: float) -> float:
         if self._was_stable(now):
-            self.hurry()
+            self.reset()
         self._running_since = None
         delay = self._next_s
         self._next_s = min(self._maximum_s, 2 * delay)
@@ -57,7 +57,7 @@ class Backoff:
         self._running_since = None
         return self._with_jitter(self._maximum_s)
 
-    def hurry(self) -> None:
+    def reset(self) -> None:
         self._next_s = self._initial_s
 
     def _was_stable(self, now: float) -> bool:

@@ -41,7 +41,9 @@ class Exchanges:
         self._pending: dict[int, Callable[[Answer], Found]] = {}
         self._steps: Steps | None = None
         self._end = Event.CLOSED
-        self.last_reply = Reply.NONE  # to a step of a procedure
+        self._last_reply = Reply.NONE  # to a step of a procedure
+        # Whether the adapter's channel may be open, as far as its answers tell; None: it was never asked.
+        self.channel_open: bool | None = None
         self.next_at: float | None = None  # the end of a pause between two steps, time.monotonic()
 
     @property
@@ -64,6 +66,8 @@ class Exchanges:
     def run(self, steps: Steps, end: Event) -> Verdict | None:
         """Performs the steps one by one; a step that was under way is forgotten, its answer awaited."""
         self.forget()
+        if end is Event.READY:
+            self.channel_open = True
         self._steps = steps
         self._end = end
         return self._advance(None)
@@ -92,6 +96,8 @@ class Exchanges:
             exchange = steps.send(answer) if answer else next(steps)
         except StopIteration:
             self._steps = None
+            if self._end is Event.CLOSED:
+                self.channel_open = self._last_reply is Reply.NONE
             return Verdict(self._end)
         except WrongDeviceError as error:
             return Verdict(Event.REFUSED, str(error))
@@ -104,7 +110,7 @@ class Exchanges:
         return None
 
     def _on_step_answer(self, exchange: Exchange, answer: Answer) -> Verdict | None:
-        self.last_reply = answer.reply
+        self._last_reply = answer.reply
         if answer.reply in exchange.accept:
             return self._advance(answer)
         advice = f": {exchange.advice}" if exchange.advice else ""

@@ -81,7 +81,11 @@ class Interface:
         """Whether it is open and carries frames."""
         return self.bus is not None and not self.reason
 
-    def adopt(self, config: Config) -> None:
+    def stop_trying(self) -> None:
+        """An interface that is not open, or down, is not looked for any more."""
+        self.retry_at = None
+
+    def reconfigure(self, config: Config) -> None:
         """Other settings, but for the interface."""
         self._config = config
 
@@ -120,6 +124,16 @@ class Interface:
         channel = self._config.bus.channel
         self._fails(logging.WARNING, warning or f"interface {channel} is down: ip link set {channel} up")
         self.retry_at = time.monotonic() + RETRY_S
+
+    def snapshot(self) -> dict[str, object]:
+        """For the status."""
+        bus = self._config.bus
+        return {
+            "interface": bus.interface,
+            "channel": bus.channel,
+            "open": self.bus is not None,
+            "up": self.is_up,
+        }
 
     def lost_frames(self) -> Counter[str]:
         """Between the relay and the interface, by reason."""

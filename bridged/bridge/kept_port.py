@@ -88,7 +88,7 @@ class KeptPort:
         self._tries = 0
         self._told.well()
 
-    def adopt(self, other: KeptPort) -> None:
+    def take_over(self, other: KeptPort) -> None:
         """Takes over what another bridge has kept."""
         self._port, other._port = other._port, None
         self._message, self._taken = other._message, other._taken

@@ -1,9 +1,23 @@
-"""The life of one bridge's adapter as a table: (state, event) -> (state, actions). No I/O, no clock."""
+"""The life of one bridge's adapter: a table (state, event) -> (state, actions), its pauses, its log lines.
+
+No I/O, no clock: the time is passed in.
+"""
 
 from __future__ import annotations
 
 import enum
-from typing import NamedTuple
+import logging
+from typing import TYPE_CHECKING, NamedTuple
+
+from bridged.bridge.backoff import Backoff, chance
+from bridged.bridge.log_limiter import LogLimiter, repeated
+
+if TYPE_CHECKING:
+    from bridged.settings import ReconnectConfig
+
+log = logging.getLogger(__name__)
+
+STOP_S = 1.2  # for an adapter that does not answer; systemd and users wait for the end
 
 
 class State(enum.Enum):
@@ -65,7 +79,7 @@ class Action(enum.Enum):
     RELEASE = enum.auto()  # give the port back
     WAIT = enum.auto()  # -> TIMER, or APPEARED if the device is plugged in anew before
     WAIT_LONG = enum.auto()  # the same
-    HURRY = enum.auto()  # pauses are short again
+    SHORTEN_PAUSES = enum.auto()  # they are as short as after the start
     FINISH = enum.auto()
 
 
@@ -75,7 +89,7 @@ Transition = tuple[State, tuple[Action, ...]]
 TABLE: dict[tuple[State, Event], Transition] = {
     (S.IDLE, E.START): (S.OPENING, (A.OPEN,)),
     (S.IDLE, E.STOP): (S.STOPPED, (A.FINISH,)),
-    (S.WAITING, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
+    (S.WAITING, E.APPEARED): (S.OPENING, (A.SHORTEN_PAUSES, A.OPEN)),
     (S.WAITING, E.TIMER): (S.WAITING, (A.LOOK,)),
     (S.WAITING, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.OPENING, E.OPENED): (S.INITIALISING, (A.INITIALISE,)),
@@ -104,10 +118,10 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.BUS_OFF, E.RESTART): (S.OPENING, (A.OPEN,)),
     (S.BUS_OFF, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.BACKOFF, E.TIMER): (S.OPENING, (A.OPEN,)),
-    (S.BACKOFF, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
+    (S.BACKOFF, E.APPEARED): (S.OPENING, (A.SHORTEN_PAUSES, A.OPEN)),
     (S.BACKOFF, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.FAULT, E.TIMER): (S.OPENING, (A.OPEN,)),
-    (S.FAULT, E.APPEARED): (S.OPENING, (A.HURRY, A.OPEN)),
+    (S.FAULT, E.APPEARED): (S.OPENING, (A.SHORTEN_PAUSES, A.OPEN)),
     (S.FAULT, E.STOP): (S.STOPPED, (A.FINISH,)),
     (S.STOPPING, E.CLOSED): (S.STOPPED, (A.RELEASE, A.FINISH)),
     (S.STOPPING, E.PORT_LOST): (S.STOPPED, (A.RELEASE, A.FINISH)),
@@ -143,3 +157,90 @@ def transition(state: State, event: Event) -> Transition:
     if (state, event) in IGNORED:
         return state, ()
     return TABLE[state, event]
+
+
+# States before the adapter runs for the first time.
+COMING_UP = (S.IDLE, S.OPENING, S.INITIALISING)
+# States that end at once when the device is plugged in.
+AWAITING_DEVICE = (S.WAITING, S.BACKOFF, S.FAULT)
+# States entered because the adapter failed.
+FAILING = (S.CLOSING, S.REJECTING)
+# States that keep showing the reason of the failure before.
+KEEPING_REASON = (*AWAITING_DEVICE, S.BUS_OFF)
+
+
+class Lifecycle:
+    """The state of one bridge's adapter, why it is in it, and when the next try is due.
+
+    The owner performs the actions that take() returns, in order, each together with schedule(), and calls
+    take() with TIMER when `next_at` has come. Times are seconds of any clock.
+    """
+
+    def __init__(self, reconnect: ReconnectConfig) -> None:
+        self.state = State.IDLE
+        self.reason = ""  # why the state is not running
+        self.next_at: float | None = None
+        self.is_restart = False  # the adapter left its CAN bus because of bus-off when it ran last
+        self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, chance)
+        self._pause_s: float | None = None  # before the next try, if the back-off does not decide
+        self._log_limiter = LogLimiter()
+
+    def reconfigure(self, reconnect: ReconnectConfig, now: float) -> None:
+        """Goes on with other pauses; one that is under way becomes shorter, if at all."""
+        self._backoff.reconfigure(reconnect.initial_s, reconnect.maximum_s)
+        if self.state in AWAITING_DEVICE and self.next_at is not None:
+            self.next_at = min(self.next_at, now + self._backoff.next_s(now))
+
+    def take(self, verdict: Verdict) -> tuple[Action, ...]:
+        """Enters the state that the event leads to. If that is another one, log_change() is to follow."""
+        before = self.state
+        self.state, actions = transition(before, verdict.event)
+        if before in {State.RUNNING, State.OPENING} and self.state is not before:
+            self._pause_s = verdict.pause_s
+        if before is State.RUNNING and self.state is not before:
+            self.is_restart = verdict.off_bus
+        return actions
+
+    def schedule(self, action: Action, now: float) -> None:
+        """Sets or clears `next_at`, if that is what the action is for."""
+        match action:
+            case Action.LOOK:  # again now and then: what is no device of the kernel's (a pty) has no event
+                self.next_at = now + self._backoff.next_s(now)
+            case Action.WAIT:
+                self.next_at = now + (self._backoff.next_s(now) if self._pause_s is None else self._pause_s)
+            case Action.WAIT_LONG:
+                self.next_at = now + self._backoff.longest_s()
+            case Action.LIMIT:
+                self.next_at = now + STOP_S
+            case Action.OPEN | Action.FINISH:
+                self.next_at = None
+            case Action.RUN:
+                self._backoff.runs(now)
+            case Action.SHORTEN_PAUSES:
+                self._backoff.reset()
+
+    def has_timed_out(self, now: float) -> bool:
+        """Whether TIMER is due. Clears `next_at`."""
+        if self.next_at is None or self.next_at > now:
+            return False
+        self.next_at = None
+        return True
+
+    def log_change(self, reason: str, now: float) -> None:
+        """One line; retries, and what is repeated too often, for those who look for a fault only."""
+        if self.state is State.BUS_OFF:
+            reason = f"the bridge has taken the adapter off its CAN bus: {self.reason}"
+        self.reason = reason or (self.reason if self.state in KEEPING_REASON else "")
+        times = self._log_limiter.tell(reason, now) if reason else None
+        if times is not None:
+            again = ""
+            if self.state in {State.CLOSING, State.BACKOFF} and self._pause_s is None:
+                again = f"; trying again in {self._backoff.coming_s(now):.2g} s"
+            log.warning("state=%s: %s%s%s", self.state.value, reason, again, repeated(times))
+            return
+        quiet = self._log_limiter.quiet if self.state is State.RUNNING else self._log_limiter.failing
+        always = self.state in {State.STOPPING, State.STOPPED, State.BUS_OFF}
+        level = logging.DEBUG if quiet and not always else logging.INFO
+        log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
+        if self.state is State.RUNNING:
+            self._log_limiter.well()

@@ -98,10 +98,21 @@ class HealthPolling:
         self._samples.clear()
         self.health.forget()
 
-    def adopt(self, interval_s: float, stuck_s: float) -> None:
+    def reconfigure(self, interval_s: float, stuck_s: float) -> None:
         """Other settings."""
         self._interval_s = interval_s
         self._stall.limit_s = stuck_s
+
+    def snapshot(self) -> dict[str, object]:
+        """For the status: the state of the CAN bus, and how quickly frames go and the adapter answers."""
+        health = self.health
+        return {
+            "bus_state": health.state.text if health.state is not None else None,
+            "tec": health.tec,
+            "rec": health.rec,
+            "rates": self.rates(),
+            "answer_time_ms": self.answer_times_ms(),
+        }
 
     def answer_times_ms(self) -> dict[str, float] | None:
         """How long the adapter took for its last answers."""

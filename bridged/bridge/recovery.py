@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STUCK_LEAST_S = 0.5  # a slow, busy bus is no reason
+UNANSWERED_LOG_S = 10.0
 REFUSING_S, REFUSING_LONGEST_S = 60.0, 3600.0
 
 ANEW = (
@@ -47,8 +48,9 @@ class Recovery:
         self._refusing_until = 0.0
         self._discarded = 0  # of the adapter's, those told
         self._told = LogLimiter()
+        self._unanswered_told = LogLimiter(UNANSWERED_LOG_S)
 
-    def adopt(self, config: Config) -> None:
+    def reconfigure(self, config: Config) -> None:
         """Other settings, but for the interface."""
         self._config = config
 
@@ -91,6 +93,13 @@ class Recovery:
             "(is it in listen-only mode?); it is initialised anew"
         )
         return Verdict(Event.SILENT, reason, pause_s)
+
+    def unanswered(self, resyncs: int, now: float) -> None:
+        """Tells that an answer is missing, and how often that was so; the relay finds the thread again."""
+        times = self._unanswered_told.tell("unanswered", now)
+        self._unanswered_told.well()
+        if times is not None:
+            log.warning("no answer from the adapter: resynchronising (resyncs=%d)", resyncs)
 
     def closed(self) -> None:
         """Tells of frames that were in the adapter's buffer."""

@@ -187,7 +187,7 @@ class Service:
             log.info("reload: nothing has changed")
             self._notifier.ready()
             return
-        if self._successor is None and self.bridge.adopt(successor.config):
+        if self._successor is None and self.bridge.reconfigure(successor.config):
             successor.close()
             log.info("reload: the configuration has changed, the adapter stays open")
             self._notifier.ready()

@@ -172,13 +172,13 @@ def main() -> int:
                         bridge.stop()
                     case [b"queue", length]:
                         transmit = replace(bridge.config.transmit, queue=int(length))
-                        assert bridge.adopt(replace(bridge.config, transmit=transmit))
+                        assert bridge.reconfigure(replace(bridge.config, transmit=transmit))
         if [fd for fd in ready if fd != 0]:
             bridge.on_readable()
         bridge.on_timer(time.monotonic())
     assert stop_at is not None
     stopped_s = time.monotonic() - stop_at
-    assert not bridge._thread.is_alive()
+    assert "relay" not in {thread.name for thread in threading.enumerate()}
     status = books.look(bridge)
     end = time.monotonic() + STOP_LIMIT_S
     while not bridge.settled and time.monotonic() < end:

@@ -10,7 +10,7 @@ from bridged.bridge.backoff import JITTER, STABLE_S, Backoff
 def test_pauses_double_to_their_maximum() -> None:
     backoff = Backoff(0.1, 1.0, lambda: 0.0)
     assert [backoff.next_s(0.0) for _ in range(5)] == [0.1, 0.2, 0.4, 0.8, 1.0]
-    backoff.hurry()
+    backoff.reset()
     assert backoff.next_s(0.0) == 0.1
     assert backoff.longest_s() == 1.0
     assert backoff.next_s(0.0) == 0.2

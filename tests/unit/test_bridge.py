@@ -19,6 +19,7 @@ from benches.simulating import until
 from bridged import _relay
 from bridged.bridge.lifecycle import Action, Event, State, Verdict
 from bridged.daemon.service import serve
+from bridged.ports.watch import Watch
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232 import State as Channel
 from bridged.simulators.serve import Fault
@@ -36,19 +37,16 @@ def test_what_an_action_leads_to_waits_until_the_actions_before_it_are_done(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bridge = bench.bridge()
-    steps: list[tuple[str, Action]] = []
+    actions: list[Action] = []
 
-    def perform(action: Action) -> None:
-        steps.append(("begin", action))
-        if action is Action.RELEASE:
-            bridge._dispatch(Verdict(Event.TIMER))
-        steps.append(("end", action))
+    def perform(action: Action) -> Verdict | None:
+        actions.append(action)
+        return Verdict(Event.TIMER) if action is Action.RELEASE else None
 
     monkeypatch.setattr(bridge, "_perform", perform)
-    bridge.state = State.CLOSING
-    bridge._dispatch(Verdict(Event.CLOSED))
-    actions = (Action.RELEASE, Action.WAIT, Action.OPEN)
-    assert steps == [(step, action) for action in actions for step in ("begin", "end")]
+    bridge._life.state = State.CLOSING
+    bridge._act_on(Verdict(Event.CLOSED))
+    assert actions == [Action.RELEASE, Action.WAIT, Action.OPEN]
     assert bridge.state is State.OPENING
     bridge.close()
 
@@ -59,10 +57,8 @@ def test_an_interface_that_was_lost_with_the_port_is_opened_again(
     """Its event comes with those of the port that is given back, which mean nothing any more."""
     bridge = bench.bridge()
     bridge._interface.open()
-    relay = SimpleNamespace(
-        detach_port=lambda: None, events=lambda: [(_relay.EVENT_INTERFACE_LOST, errno.ENODEV, b"")]
-    )
-    monkeypatch.setattr(bridge, "_relay", relay)
+    relay = SimpleNamespace(events=lambda: [(_relay.EVENT_INTERFACE_LOST, errno.ENODEV, b"")])
+    monkeypatch.setattr(bridge._loop, "relay", relay)
     bridge._release()
     assert bridge._interface.bus is None
     assert bridge._interface.reason.startswith("bus lost: pair")
@@ -234,7 +230,7 @@ def test_plugged_in_late_and_told_at_once(bench: Bench, caplog: pytest.LogCaptur
     lines = [
         record.getMessage().partition(":")[0]
         for record in caplog.records
-        if record.name == "bridged.bridge.bridge"
+        if record.name == "bridged.bridge.lifecycle"
     ]
     assert [line for line in lines if "state=" in line] == [
         "state=opening",
@@ -246,8 +242,12 @@ def test_plugged_in_late_and_told_at_once(bench: Bench, caplog: pytest.LogCaptur
 
 
 def test_what_has_no_events_is_found_by_looking(bench: Bench) -> None:
+    class Deaf(Watch):
+        def arm(self) -> None:
+            pass
+
+    bench.watch = Deaf(str(bench.link))
     bridge = bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.05}")
-    bridge._watch._set_membership = lambda _option: None  # type: ignore[method-assign]
     started(bridge, State.WAITING)
     bench.plug_in(Can232(time.monotonic()))
     run_until(bridge, lambda: bridge.state is State.RUNNING)
@@ -260,20 +260,16 @@ def test_the_same_failure_is_told_once(bench: Bench, caplog: pytest.LogCaptureFi
     device = Can232(time.monotonic())
     device.silent = True
     bench.plug_in(device)
+    caplog.set_level(logging.DEBUG)
     bridge = bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.02}")
-    failures = 0
-    transit = bridge._transit
-
-    def counting(verdict: Verdict) -> None:
-        nonlocal failures
-        failures += verdict.event is Event.UNANSWERED
-        transit(verdict)
-
-    bridge._transit = counting  # type: ignore[method-assign]
     bridge.start()
-    run_until(bridge, lambda: failures == 3)
+
+    def levels() -> list[int]:
+        return [record.levelno for record in caplog.records if "no answer to V" in record.getMessage()]
+
+    run_until(bridge, lambda: len(levels()) == 3)
     stopped(bridge)
-    assert sum("no answer to V" in record.getMessage() for record in caplog.records) == 1
+    assert levels() == [logging.WARNING, logging.DEBUG, logging.DEBUG]
 
 
 def test_refused_frames_are_explained_and_sent_again(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
@@ -416,4 +412,4 @@ def test_a_bug_at_the_start_does_not_leave_the_process_behind(bench: Bench) -> N
     bridge = bench.bridge()
     with pytest.raises(ZeroDivisionError):
         serve(bridge, None)
-    assert not bridge._thread.is_alive()
+    assert "relay" not in {thread.name for thread in threading.enumerate()}

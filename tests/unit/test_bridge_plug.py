@@ -9,11 +9,12 @@ import time
 import pytest
 from benches.bridge import Bench, run_until, started, stopped
 
-from bridged.bridge import bridge as bridge_module
+from bridged.bridge import port as port_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
 from bridged.errors import PortError
 from bridged.ports import Port, open_port
+from bridged.ports.watch import Watch
 from bridged.simulators.can232 import Can232
 
 
@@ -27,11 +28,12 @@ def test_what_was_plugged_in_is_tried_until_it_can_be_opened(bench: Bench, failu
 
 
 def test_what_stays_closed_is_not_tried_for_ever(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridge_module, "SETTLE_S", 0.0)
+    monkeypatch.setattr(port_module, "SETTLE_S", 0.0)
     bridge, tries = plugged_in(bench, 10)
     run_until(bridge, lambda: bridge.state is State.BACKOFF)
-    assert bridge._timer is not None
-    assert bridge._timer > time.monotonic() + 10
+    timer = bridge.next_timer()
+    assert timer is not None
+    assert timer > time.monotonic() + 10
     stopped(bridge)
     assert len(tries) == 1
 
@@ -62,6 +64,15 @@ def test_a_numbered_terminal_is_not_taken_again(bench: Bench) -> None:
     """Once the simulator has ended, the next terminal of its number is somebody's shell."""
     bench.plug_in(Can232(time.monotonic()))
     bench.link = bench.link.resolve()
+    looks = 0
+
+    class Counting(Watch):
+        def is_there(self) -> bool:
+            nonlocal looks
+            looks += 1
+            return super().is_there()
+
+    bench.watch = Counting(str(bench.link))
     bridge = started(bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.01}"))
     bench.pull_out()
     run_until(bridge, lambda: bridge.state is State.WAITING)
@@ -74,10 +85,8 @@ def test_a_numbered_terminal_is_not_taken_again(bench: Bench) -> None:
             stack.callback(os.close, slave)
             name = os.ttyname(slave)
         before = termios.tcgetattr(slave)
-        looks = []
-        is_there = bridge._watch.is_there
-        bridge._watch.is_there = lambda: looks.append(0) or is_there()  # type: ignore[func-returns-value, method-assign]
-        run_until(bridge, lambda: len(looks) > 3)
+        looks = 0
+        run_until(bridge, lambda: looks > 3)
         assert bridge.state is State.WAITING
         assert termios.tcgetattr(slave) == before
         os.set_blocking(master, False)

@@ -203,7 +203,7 @@ def test_another_bridge_takes_it_over(caplog: pytest.LogCaptureFixture) -> None:
     with rig_with() as rig:
         bridge = Bridge(rig, 20)
         other = KeptPort(rig.relay)
-        other.adopt(bridge.kept)
+        other.take_over(bridge.kept)
         told = len(caplog.messages)
         bridge.kept.close()
         assert len(caplog.messages) == told  # nothing is lost

@@ -142,8 +142,8 @@ class World(RuleBasedStateMachine):
     def do_wait_long(self) -> None:
         self.set_timer(self.backoff.longest_s())
 
-    def do_hurry(self) -> None:
-        self.backoff.hurry()
+    def do_shorten_pauses(self) -> None:
+        self.backoff.reset()
 
     def do_finish(self) -> None:
         assert not self.port_open

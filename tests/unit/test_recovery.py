@@ -13,7 +13,7 @@ from benches.bridge import FRAME, Bench, Usb2canBench, run_until, started, stopp
 from benches.simulating import until
 
 from bridged.adapters.base import Steps
-from bridged.bridge import bridge as bridge_module
+from bridged.bridge import lifecycle
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Event, State, Verdict
 from bridged.bridge.recovery import Recovery
@@ -140,7 +140,7 @@ def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["adapter-away"] == 1)
     assert (bridge.state, bridge.next_timer()) == (State.BUS_OFF, None)
     if event is Event.RESTART:
-        bridge._dispatch(Verdict(event))
+        bridge._act_on(Verdict(event))
         run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.ERROR_ACTIVE.text)
     stopped(bridge)
     assert can232.frames == []
@@ -173,7 +173,7 @@ def test_a_usb2can_is_taken_off_the_bus_if_it_is_not_to_restart_itself(
     assert frames_on_bus(usb2can).count(error_frame(CAN_ERR_BUSOFF)) == 1
     device.set_bus_off(time.monotonic(), False)
     if restart == "never":
-        bridge._dispatch(Verdict(Event.RESTART))
+        bridge._act_on(Verdict(Event.RESTART))
     run_until(bridge, lambda: bridge.state is State.RUNNING)
     assert error_frame(CAN_ERR_RESTARTED) in frames_on_bus(usb2can)
     stopped(bridge)
@@ -200,7 +200,7 @@ def test_an_adapter_that_does_not_answer_cannot_delay_the_end(
     can232: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """On a slow line answers may take longer than anybody waits; what closes it is sent all the same."""
-    monkeypatch.setattr(bridge_module, "STOP_S", 0.05)
+    monkeypatch.setattr(lifecycle, "STOP_S", 0.05)
     device = Can232(time.monotonic())
     can232.plug_in(device)
     bridge = started(can232.bridge())
@@ -218,11 +218,11 @@ def test_frames_go_on_while_settings_change(can232: Bench) -> None:
     for transmit in ("{deadline: 3.0}", "{queue: 12, deadline: 3.0}", "{queue: 2000}"):
         send(can232, next(ids), 4)
         other = can232.bridge(transmit=transmit)
-        assert bridge.adopt(other.config)
+        assert bridge.reconfigure(other.config)
         other.close()
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_frames"] == 12)
     other = can232.bridge(transmit="{window: 2}")
-    assert not bridge.adopt(other.config)
+    assert not bridge.reconfigure(other.config)
     other.close()
     stopped(bridge)
     assert [frame.can_id for frame in can232.frames] == [1] * 4 + [2] * 4 + [3] * 4

@@ -456,7 +456,7 @@ class TestWatchdog:
         bridge = Bridge(load(write_config(tmp_path / "one.yaml")), FileMemory(tmp_path))
         assert bridge.has_turned()  # nothing to compare with yet
         assert not bridge.has_turned()
-        bridge._relay.turn(0)
+        bridge._loop.relay.turn(0)
         assert bridge.has_turned()
         bridge.close()
 
