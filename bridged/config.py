@@ -15,11 +15,13 @@ from bridged import adapters, can
 from bridged.ports.names import PortName
 from bridged.settings import (
     AdapterConfig,
+    After,
     BusConfig,
     ChannelConfig,
     Config,
     HealthConfig,
     ReconnectConfig,
+    Restart,
     TransmitConfig,
 )
 from bridged.text import quoted
@@ -50,7 +52,7 @@ Register = Annotated[int, Meta(ge=0, le=0xFF, description="a register value from
 SamplePoint = Annotated[
     float, Meta(ge=0.5, le=0.95, description="a fraction of the bit time from 0.5 to 0.95")
 ]
-Restart = Annotated[
+RestartTime = Annotated[
     Annotated[int, Meta(ge=1, le=60_000)] | Literal["never"],
     Meta(description="a number of milliseconds from 1 to 60000, or never"),
 ]
@@ -81,7 +83,7 @@ class _ChannelKeys(Struct, frozen=True, kw_only=True):
     sample_point: SamplePoint | None = None
     listen_only: Flag = False
     acceptance: _AcceptanceKeys | None = None
-    restart: Restart | None = None
+    restart: RestartTime | None = None
 
 
 class _BusKeys(Struct, frozen=True, kw_only=True):
@@ -346,16 +348,15 @@ def _read_channel(section: Section | None, adapter: AdapterConfig | None) -> Cha
         acceptance = can.AcceptanceFilter(keys.code, keys.mask, single=keys.mode == "single")
     if timing is None or adapter is None:
         return None
-    restart: int | str | None = values.get("restart")
-    if isinstance(restart, int):
-        restart_s: float | None = restart / 1000
-    else:
-        restart_s = None if restart == "never" else adapter.default_restart_s
+    milliseconds: int | str | None = values.get("restart")
+    restart = adapter.default_restart
+    if milliseconds is not None:
+        restart = After(milliseconds / 1000) if isinstance(milliseconds, int) else Restart.NEVER
     return ChannelConfig(
         timing=timing,
         listen_only=values.get("listen_only", False),
         acceptance=acceptance,
-        restart_s=restart_s,
+        restart=restart,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Collection, Iterable, Mapping  # noqa: TC003 - msgspec looks at the annotations
 from pathlib import Path  # noqa: TC003 - as above
 from typing import Any, ClassVar
@@ -9,6 +10,19 @@ from typing import Any, ClassVar
 from msgspec import Struct
 
 from bridged.can import AcceptanceFilter, BitTiming  # noqa: TC001 - as above
+
+
+class Restart(enum.Enum):
+    """Who puts an adapter that is bus-off on its CAN bus again. The third way is `After`."""
+
+    ITSELF = enum.auto()  # the adapter does; its channel stays open
+    NEVER = enum.auto()  # its channel is closed until the interface comes up anew
+
+
+class After(Struct, frozen=True):
+    """The bridge closes the adapter's channel when that is bus-off, and opens it after so long."""
+
+    seconds: float
 
 
 class AdapterConfig(Struct, frozen=True, kw_only=True):
@@ -22,7 +36,7 @@ class AdapterConfig(Struct, frozen=True, kw_only=True):
     port: str
 
     default_window: ClassVar[int]  # of section transmit, in frames
-    default_restart_s: ClassVar[float | None]  # of section channel: see ChannelConfig
+    default_restart: ClassVar[Restart | After]  # of section channel
     bitrates: ClassVar[Collection[int]]  # bit/s, those that take no BTR0 and BTR1
     identified_by_usb: ClassVar[bool] = False  # a key `serial_number` means the USB device behind `port`
     schemes: ClassVar[tuple[str, ...]]  # URLs that `port` may have
@@ -63,16 +77,12 @@ class AdapterConfig(Struct, frozen=True, kw_only=True):
 
 
 class ChannelConfig(Struct, frozen=True, kw_only=True):
-    """The CAN bus behind the adapter. `acceptance` None: every frame passes.
-
-    `restart_s`: after bus-off the channel is closed, and opened again after so long; None: not until the
-    interface comes up anew; 0: it stays open, the adapter restarts itself.
-    """
+    """The CAN bus behind the adapter. `acceptance` None: every frame passes. `restart`: after bus-off."""
 
     timing: BitTiming
     listen_only: bool = False
     acceptance: AcceptanceFilter | None = None
-    restart_s: float | None = 0.0
+    restart: Restart | After = Restart.ITSELF
 
 
 class BusConfig(Struct, frozen=True, kw_only=True):

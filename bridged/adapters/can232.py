@@ -31,7 +31,7 @@ from bridged.adapters.base import (
 )
 from bridged.can import BusState
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.settings import AdapterConfig
+from bridged.settings import AdapterConfig, After
 from bridged.text import printable
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class Can232Config(AdapterConfig, frozen=True, kw_only=True):
     firmware: Firmware | None = None
 
     default_window: ClassVar[int] = 1
-    default_restart_s: ClassVar[float | None] = 0.1
+    default_restart = After(0.1)
     bitrates = BITRATE_COMMANDS.keys()
     schemes: ClassVar[tuple[str, ...]] = ("socket", "rfc2217")
     refused_schemes: ClassVar[Mapping[str, str]] = {

@@ -28,7 +28,7 @@ from bridged.adapters.base import (
 )
 from bridged.can import STANDARD_REGISTERS, BusState, state_of
 from bridged.errors import AdapterError, WrongDeviceError
-from bridged.settings import AdapterConfig
+from bridged.settings import AdapterConfig, Restart
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -123,7 +123,7 @@ class Usb2canConfig(AdapterConfig, frozen=True, kw_only=True):
     ready_limit: ReadyLimit = DEFAULT_READY
 
     default_window: ClassVar[int] = 16
-    default_restart_s: ClassVar[float | None] = 0.0  # it restarts itself
+    default_restart = Restart.ITSELF
     bitrates = STANDARD_REGISTERS.keys()
     identified_by_usb: ClassVar[bool] = True  # no command tells its serial number
     schemes: ClassVar[tuple[str, ...]] = ("socket", "usb")

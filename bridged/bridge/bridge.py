@@ -40,6 +40,7 @@ from bridged.can import BusState
 from bridged.interfaces import open_bus as open_any_interface
 from bridged.ports import open_port as open_any_port
 from bridged.ports.watch import Watch
+from bridged.settings import Restart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -201,7 +202,7 @@ class Bridge:
         transmit = replace(
             present.transmit, queue=config.transmit.queue, deadline_s=config.transmit.deadline_s
         )
-        channel = replace(present.channel, restart_s=config.channel.restart_s)
+        channel = replace(present.channel, restart=config.channel.restart)
         if config != replace(
             present, channel=channel, transmit=transmit, health=config.health, reconnect=config.reconnect
         ):
@@ -212,7 +213,7 @@ class Bridge:
         self._recovery.reconfigure(config)
         self._polling.reconfigure(config.health.interval_s, stuck_s(config))
         self._life.reconfigure(config.reconnect, time.monotonic())
-        if channel.restart_s is not None:
+        if channel.restart is not Restart.NEVER:
             self._act_on(Verdict(Event.RESTART))
         if self._polling.health.state is BusState.BUS_OFF:
             self._act_on(Finding(bus_off="bus-off"))
@@ -322,7 +323,7 @@ class Bridge:
                 return Verdict(Event.SILENT, found.failure)
             if not found.bus_off or self.state is not State.RUNNING:
                 return None
-            found = self._recovery.off(found.bus_off)
+            found = self._recovery.bus_off(found.bus_off)
         if found is not None and found.off_bus:
             for frame in self._polling.taken_off().error_frames:
                 self._interface.put_error_frame(frame)

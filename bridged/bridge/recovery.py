@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from bridged.bridge.backoff import Backoff, chance
 from bridged.bridge.lifecycle import Event, Verdict
 from bridged.bridge.log_limiter import LogLimiter, repeated
+from bridged.settings import After, Restart
 
 if TYPE_CHECKING:
     from bridged.adapters.base import Adapter
@@ -54,19 +55,19 @@ class Recovery:
         """Other settings, but for the interface."""
         self._config = config
 
-    def off(self, cause: str) -> Verdict | None:
+    def bus_off(self, cause: str) -> Verdict | None:
         """The adapter is bus-off, or cannot tell whether it is."""
-        restart_s = self._config.channel.restart_s
-        if restart_s == 0.0:  # it restarts itself
+        restart = self._config.channel.restart
+        if isinstance(restart, After):
+            return Verdict(Event.SILENT, f"{cause}{ANEW}", restart.seconds, off_bus=True)
+        if restart is Restart.ITSELF:
             return None
-        if restart_s is None:
-            bus = self._config.bus
-            how = "a new start of the bridge"
-            if bus.interface == "socketcan":
-                how = f"ip link set {bus.channel} down, then up,"
-            reason = f"{cause}; channel.restart is never: {how} puts it on the bus again"
-            return Verdict(Event.BUS_OFF, reason, off_bus=True)
-        return Verdict(Event.SILENT, f"{cause}{ANEW}", restart_s, off_bus=True)
+        bus = self._config.bus
+        how = "a new start of the bridge"
+        if bus.interface == "socketcan":
+            how = f"ip link set {bus.channel} down, then up,"
+        reason = f"{cause}; channel.restart is never: {how} puts it on the bus again"
+        return Verdict(Event.BUS_OFF, reason, off_bus=True)
 
     def stuck(self, frames: int, polling: HealthPolling) -> Verdict | None:
         """The adapter has taken no frame for stuck_s(), or none has left it.
@@ -82,7 +83,7 @@ class Recovery:
             reason = f"{cause}, {frames} are in its buffer ({why}){ANEW}"
             return Verdict(Event.SILENT, reason, pause_s)
         if polling.was_full(limit_s):  # it cannot tell bus-off
-            return self.off(
+            return self.bus_off(
                 f"{cause} (does another node acknowledge them?), its status: {polling.description}"
             )
         if now < self._refusing_until:

@@ -20,7 +20,7 @@ from bridged.adapters.usb2can import Usb2canConfig
 from bridged.can import AcceptanceFilter, BitTiming
 from bridged.config import load
 from bridged.errors import ConfigError
-from bridged.settings import BusConfig, ChannelConfig, Config, ReconnectConfig, TransmitConfig
+from bridged.settings import After, BusConfig, ChannelConfig, Config, ReconnectConfig, Restart, TransmitConfig
 from bridged.yaml_source import key_names
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def test_the_whole_schema(file: Path) -> None:
             timing=BitTiming(125_000),
             listen_only=False,
             acceptance=AcceptanceFilter(0x6000, 0x1FF0, False),
-            restart_s=0.1,
+            restart=After(0.1),
         ),
         bus=BusConfig(interface="socketcan", channel="vcan0", create=True, options={}),
         transmit=TransmitConfig(queue=1024, window=1, deadline_s=1.0),
@@ -143,25 +143,25 @@ def test_defaults(file: Path) -> None:
         type="can232", port="/dev/ttyUSB0", baudrate=57_600, serial_number=None
     )
     assert loaded.channel == ChannelConfig(
-        timing=BitTiming(125_000), listen_only=False, acceptance=None, restart_s=0.1
+        timing=BitTiming(125_000), listen_only=False, acceptance=None, restart=After(0.1)
     )
     assert loaded.bus == BusConfig(interface="socketcan", channel="vcan0", create=False, options={})
     assert loaded.transmit == TransmitConfig(queue=1024, window=1, deadline_s=1.0)
 
 
 @pytest.mark.parametrize(
-    ("adapter", "keys", "restart_s"),
+    ("adapter", "keys", "restart"),
     [
-        ("{type: can232, port: /dev/x}", ", restart: 1", 0.001),
-        ("{type: can232, port: /dev/x}", ", restart: never", None),
-        ("{type: usb2can, port: /dev/x}", "", 0.0),
-        ("{type: usb2can, port: /dev/x}", ", restart: 60000", 60.0),
-        ("{type: usb2can, port: /dev/x}", ", restart: 'never'", None),
+        ("{type: can232, port: /dev/x}", ", restart: 1", After(0.001)),
+        ("{type: can232, port: /dev/x}", ", restart: never", Restart.NEVER),
+        ("{type: usb2can, port: /dev/x}", "", Restart.ITSELF),
+        ("{type: usb2can, port: /dev/x}", ", restart: 60000", After(60.0)),
+        ("{type: usb2can, port: /dev/x}", ", restart: 'never'", Restart.NEVER),
     ],
 )
-def test_restart(file: Path, adapter: str, keys: str, restart_s: float | None) -> None:
+def test_restart(file: Path, adapter: str, keys: str, restart: Restart | After) -> None:
     file.write_text(four_lines(adapter, channel=f"{{bitrate: 125000{keys}}}"))
-    assert load(file).channel.restart_s == restart_s
+    assert load(file).channel.restart == restart
 
 
 def test_usb2can(file: Path) -> None:

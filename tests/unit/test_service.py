@@ -29,6 +29,7 @@ from bridged.daemon.service import Service
 from bridged.errors import BusError
 from bridged.interfaces.base import Bus
 from bridged.interfaces.python_can import open_python_can
+from bridged.settings import Restart
 
 DEADLINE_S = 20.0
 RUNNING = "running: USB2CAN HW0003FW0016 RIG0001 on /dev/ttyUSB0, vcan0"
@@ -339,7 +340,7 @@ class TestReload:
         assert "reload: the configuration has changed, the adapter stays open" in caplog.messages
         config = first.config
         assert (config.transmit.deadline_s, config.health.interval_s) == (2.0, 0.5)
-        assert (config.reconnect.initial_s, config.channel.restart_s) == (2.0, None)
+        assert (config.reconnect.initial_s, config.channel.restart) == (2.0, Restart.NEVER)
 
     def test_another_bus_is_opened(self, running: tuple[Service, Path, list[str]]) -> None:
         made, file, heard = running
