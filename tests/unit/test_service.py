@@ -453,14 +453,6 @@ class TestWatchdog:
         made._feed(10.0)
         assert heard == ["WATCHDOG=1"] * 2
 
-    def test_a_relay_that_does_not_run_has_not_turned(self, tmp_path: Path) -> None:
-        bridge = Bridge(load(write_config(tmp_path / "one.yaml")), FileMemory(tmp_path))
-        assert bridge.has_turned()  # nothing to compare with yet
-        assert not bridge.has_turned()
-        bridge._loop.relay.turn(0)
-        assert bridge.has_turned()
-        bridge.close()
-
 
 @pytest.mark.parametrize(
     ("state", "reason", "bus_open", "line"),
