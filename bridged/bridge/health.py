@@ -50,7 +50,7 @@ class Health:
         self.rec: int | None = None
         self.restarts = 0  # after bus-off
         self.happened: dict[str, int] = {}
-        self._told = BusState.ERROR_ACTIVE  # to the bus
+        self._reported = BusState.ERROR_ACTIVE  # to the interface
         self._seen_s = 0.0  # when `state` was seen last, where it is not lasting
 
     def forget(self) -> None:
@@ -70,9 +70,9 @@ class Health:
 
     def taken_off(self) -> list[bytes]:
         """The bridge takes the adapter off its CAN bus, whatever that says; the error frames for it."""
-        if self._told is BusState.BUS_OFF:
+        if self._reported is BusState.BUS_OFF:
             return []
-        self._told = BusState.BUS_OFF
+        self._reported = BusState.BUS_OFF
         return [error_frame(CAN_ERR_BUSOFF)]
 
     def _happened(self, happened: Happened) -> Iterator[bytes]:
@@ -94,8 +94,8 @@ class Health:
                 return False
             self._seen_s = now_s
         self.state = state
-        news = state != self._told
-        self._told = state
+        news = state != self._reported
+        self._reported = state
         return news
 
     def _state_frame(self) -> bytes:

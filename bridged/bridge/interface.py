@@ -43,7 +43,7 @@ class Interface:
         self._config = config
         self._relay = relay
         self._open_interface = open_interface
-        self._told = LogLimiter()
+        self._log_limiter = LogLimiter()
         self._dropped_before: Counter[str] = Counter()  # on buses that were closed since
 
     def open(self) -> None:
@@ -203,14 +203,14 @@ class Interface:
 
     def _fails(self, level: int, reason: str) -> None:
         self.reason = reason
-        times = self._told.tell(reason, time.monotonic())
-        if times is not None:
+        times = self._log_limiter.should_log(reason, time.monotonic())
+        if times:
             log.log(level, "%s%s", reason, repeated(times))
 
     def _is_well(self, text: str) -> None:
         self.reason = ""
-        log.log(logging.DEBUG if self._told.quiet else logging.INFO, "%s", text)
-        self._told.well()
+        log.log(logging.DEBUG if self._log_limiter.quiet else logging.INFO, "%s", text)
+        self._log_limiter.recovered()
 
 
 class ErrorFrameLimit:

@@ -42,7 +42,7 @@ class KeptPort:
         self._message, self._taken = b"", 0  # what the port took a part of
         self._unread = False  # frames, since the adapter ran last
         self._tries = 0
-        self._told = LogLimiter()
+        self._log_limiter = LogLimiter()
 
     def release(self, port: Port) -> None:
         """After the relay's detach_port()."""
@@ -86,7 +86,7 @@ class KeptPort:
         self._message, self._taken = b"", 0
         self._unread = False
         self._tries = 0
-        self._told.well()
+        self._log_limiter.recovered()
 
     def take_over(self, other: KeptPort) -> None:
         """Takes over what another bridge has kept."""
@@ -114,8 +114,8 @@ class KeptPort:
             self._port = None
 
     def _tell(self, text: str) -> None:
-        times = self._told.tell(text, time.monotonic())
-        if times is not None:
+        times = self._log_limiter.should_log(text, time.monotonic())
+        if times:
             log.warning("%s%s", text, repeated(times))
 
 

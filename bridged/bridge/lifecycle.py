@@ -231,8 +231,8 @@ class Lifecycle:
         if self.state is State.BUS_OFF:
             reason = f"the bridge has taken the adapter off its CAN bus: {self.reason}"
         self.reason = reason or (self.reason if self.state in KEEPING_REASON else "")
-        times = self._log_limiter.tell(reason, now) if reason else None
-        if times is not None:
+        times = self._log_limiter.should_log(reason, now) if reason else 0
+        if times:
             again = ""
             if self.state in {State.CLOSING, State.BACKOFF} and self._pause_s is None:
                 again = f"; trying again in {self._backoff.coming_s(now):.2g} s"
@@ -243,4 +243,4 @@ class Lifecycle:
         level = logging.DEBUG if quiet and not always else logging.INFO
         log.log(level, "state=%s%s%s", self.state.value, ": " if reason else "", reason)
         if self.state is State.RUNNING:
-            self._log_limiter.well()
+            self._log_limiter.recovered()

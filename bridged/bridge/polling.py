@@ -71,8 +71,8 @@ class HealthPolling:
         self._full_at = -math.inf  # when it said last that its transmit buffer was full
         self._refused = False  # frames, since the last look
         self._overtaken = False  # the adapter spoke by itself meanwhile: some answers are older than that
-        self._warned = LogLimiter(LOG_INTERVAL_S)
-        self._told = LogLimiter()  # of bus states
+        self._warning_limiter = LogLimiter(LOG_INTERVAL_S)
+        self._log_limiter = LogLimiter()  # of bus states
 
     def start(self, now: float, *, restarted: bool = False) -> Finding:
         """The adapter runs; `restarted`: after bus-off."""
@@ -253,19 +253,19 @@ class HealthPolling:
     def _log_state(self, state: BusState, description: str) -> None:
         """A bus that is never well for long is not told each time."""
         if state is BusState.ERROR_ACTIVE:
-            level = logging.DEBUG if self._told.quiet else logging.INFO
+            level = logging.DEBUG if self._log_limiter.quiet else logging.INFO
             log.log(level, "CAN bus: %s again", state.text)
-            self._told.well()
+            self._log_limiter.recovered()
             return
-        times = self._told.tell(state.text, time.monotonic())
-        if times is not None:
+        times = self._log_limiter.should_log(state.text, time.monotonic())
+        if times:
             log.warning("CAN bus: %s: %s%s", state.text, description, repeated(times))
 
     def _warn(self, pattern: str, text: str) -> None:
         """Each text once in LOG_INTERVAL_S, and not too often in an hour."""
-        times = self._warned.tell(pattern % text, time.monotonic())
-        self._warned.well()  # what comes again is news, if it does not come all the time
-        if times is not None:
+        times = self._warning_limiter.should_log(pattern % text, time.monotonic())
+        self._warning_limiter.recovered()  # what comes again is news, if it does not come all the time
+        if times:
             log.warning(f"{pattern}%s", text, repeated(times))
 
 

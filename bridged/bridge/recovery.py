@@ -48,8 +48,8 @@ class Recovery:
         self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, chance)
         self._refusing_until = 0.0
         self._discarded = 0  # of the adapter's, those told
-        self._told = LogLimiter()
-        self._unanswered_told = LogLimiter(UNANSWERED_LOG_S)
+        self._log_limiter = LogLimiter()
+        self._unanswered_limiter = LogLimiter(UNANSWERED_LOG_S)
 
     def reconfigure(self, config: Config) -> None:
         """Other settings, but for the interface."""
@@ -97,15 +97,15 @@ class Recovery:
 
     def unanswered(self, resyncs: int, now: float) -> None:
         """Tells that an answer is missing, and how often that was so; the relay finds the thread again."""
-        times = self._unanswered_told.tell("unanswered", now)
-        self._unanswered_told.well()
-        if times is not None:
+        times = self._unanswered_limiter.should_log("unanswered", now)
+        self._unanswered_limiter.recovered()
+        if times:
             log.warning("no answer from the adapter: resynchronising (resyncs=%d)", resyncs)
 
     def closed(self) -> None:
         """Tells of frames that were in the adapter's buffer."""
         frames, self._discarded = self._adapter.discarded - self._discarded, self._adapter.discarded
-        times = self._told.tell("discarded", time.monotonic()) if frames else None
-        if times is not None:
+        times = self._log_limiter.should_log("discarded", time.monotonic()) if frames else 0
+        if times:
             text = "frames did not leave the adapter before its channel was closed: they are thrown away"
             log.warning("%d %s%s", frames, text, repeated(times))

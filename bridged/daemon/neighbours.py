@@ -50,7 +50,7 @@ class Neighbours:
         self._search_at = self._look_at = 0.0
         self._equal_looks = 0
         self._thread: threading.Thread | None = None
-        self._told = LogLimiter()
+        self._log_limiter = LogLimiter()
 
     def look(self, bridge: Bridge, now: float) -> None:
         """Starts to search, or to compare frames, if it is time."""
@@ -95,7 +95,7 @@ class Neighbours:
         self._equal_looks = self._equal_looks + 1 if equal else 0
         if not equal and bridge.circle:
             bridge.circle = ""
-            self._told.well()
+            self._log_limiter.recovered()
             log.info("frames no longer go in a circle")
         return self._equal_looks >= CIRCLE_LOOKS
 
@@ -146,8 +146,8 @@ class Neighbours:
             "what the other receives. Take one of the adapters off that bus, or give its bridge another "
             "interface (bus.channel)"
         )
-        times = self._told.tell(circle, time.monotonic())
-        if times is not None:
+        times = self._log_limiter.should_log(circle, time.monotonic())
+        if times:
             log.error("%s%s", circle, repeated(times))
         bridge.circle = circle
 

@@ -7,10 +7,10 @@ adapter {type, port, version, serial_number}, bus {interface, channel, open, up:
 frames},
 counters {rx_frames: frames put on the interface; tx_frames: frames the adapter vouches for; tx_queued: frames
 of which it says no more than that they are in its buffer; tx_unconfirmed: frames of which it says nothing;
-rx_errors: pieces of noise from the adapter; tx_retries: frames sent once more; tx_returned: frames the adapter
-handed back; tx_stops, rx_overruns: how often it said "stop", "I lost frames"; reconnects: how often it ran
-again; bus_off_restarts; tx_full, rx_overflow, arbitration_lost, bus_error: how often it said so (those that it ever
-said); error_frames, error_frames_lost: those on the interface, and those that it did not take;
+rx_errors: pieces of noise from the adapter; tx_retries: frames sent once more; tx_returned: frames the
+adapter handed back; tx_stops, rx_overruns: how often it said "stop", "I lost frames"; reconnects: how often
+it ran again; bus_off_restarts; tx_full, rx_overflow, arbitration_lost, bus_error: how often it said so (those
+that it ever said); error_frames, error_frames_lost: those on the interface, and those that it did not take;
 error_frames_left_out: those that came too quickly one after the other, where the last one says it all;
 tx_discarded: of tx_frames, those that did not leave the adapter's own buffer for so long that it was emptied;
 tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
