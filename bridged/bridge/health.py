@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from bridged.adapters.base import Happened, Observation
@@ -51,6 +52,9 @@ class Health:
         self.restarts = 0  # after bus-off
         self.happened: dict[str, int] = {}
         self._reported = BusState.ERROR_ACTIVE  # to the interface
+        self.description = ""  # what the adapter said last
+        self._heard_s = 0.0
+        self._full_s = -math.inf  # when it said last that its transmit buffer was full
         self._seen_s = 0.0  # when `state` was seen last, where it is not lasting
 
     def forget(self) -> None:
@@ -60,13 +64,21 @@ class Health:
     def observe(self, seen: Observation, now_s: float) -> list[bytes]:
         """Take it in; the error frames (struct can_frame) that tell the bus what is new."""
         frames: list[bytes] = []
+        self.description = seen.description
+        self._heard_s = now_s
         if seen.tec is not None:
             self.tec, self.rec = seen.tec, seen.rec
         if seen.happened is not Happened.NOTHING:  # seldom, and enum.Flag is slow
+            if seen.happened & Happened.TX_FULL:
+                self._full_s = now_s
             frames += self._happened(seen.happened)
         if self._changed(seen, now_s):
             frames.append(self._state_frame())
         return frames
+
+    def was_full(self, seconds: float) -> bool:
+        """Whether the adapter's transmit buffer was full in so many seconds before it was heard last."""
+        return self._heard_s - self._full_s <= seconds
 
     def taken_off(self) -> list[bytes]:
         """The bridge takes the adapter off its CAN bus, whatever that says; the error frames for it."""

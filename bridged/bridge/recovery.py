@@ -84,13 +84,13 @@ class Recovery:
             return Verdict(Event.SILENT, reason, pause_s)
         if polling.was_full(limit_s):  # it cannot tell bus-off
             return self.bus_off(
-                f"{cause} (does another node acknowledge them?), its status: {polling.description}"
+                f"{cause} (does another node acknowledge them?), its status: {polling.health.description}"
             )
         if now < self._refusing_until:
             return None
         self._refusing_until = now + self._refusing.next_s(now)
         reason = (
-            f"the adapter refuses every frame, its status: {polling.description} "
+            f"the adapter refuses every frame, its status: {polling.health.description} "
             "(is it in listen-only mode?); it is initialised anew"
         )
         return Verdict(Event.SILENT, reason, pause_s)
