@@ -225,7 +225,7 @@ def test_another_bridge_sends_the_rest_of_a_frame_that_the_port_took_a_part_of()
         kept = KeptPort(cut)
         kept.release(port)
         other = KeptPort(other_relay)
-        other.adopt(kept)
+        other.take_over(kept)
         assert kept.take() is None
         assert other.take() is port
         other.resume()

@@ -19,6 +19,7 @@ from bridged.bridge.lifecycle import Event, State, Verdict
 from bridged.bridge.recovery import Recovery
 from bridged.can import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_RESTARTED, CRTL_ACTIVE, BusState, error_frame
 from bridged.interfaces.python_can import PythonCanBus
+from bridged.settings import After, Restart
 from bridged.simulators.can232 import Can232
 
 OLD, NEW = 0x100, 0x1FFFFFFF
@@ -189,7 +190,7 @@ def test_another_restart_that_is_reloaded_counts_for_a_bus_off_that_lasts(
     run_until(bridge, lambda: bridge.snapshot()["bus_state"] == BusState.BUS_OFF.text)
     assert bridge.state is State.RUNNING
     other = usb2can.bridge(f"bitrate: 500000, restart: {restart}")
-    assert bridge.adopt(other.config)
+    assert bridge.reconfigure(other.config)
     other.close()
     run_until(bridge, lambda: bridge.state is state)
     assert device.chip.in_reset
@@ -283,17 +284,17 @@ def test_a_stop_does_not_wait_for_an_error_passive_adapter(
 
 
 @pytest.mark.parametrize(
-    ("restart_s", "verdict"),
+    ("restart", "verdict"),
     [
-        (0.0, None),
-        (2.5, (Event.SILENT, 2.5, True)),  # the pause is that of the configuration, not the back-off's
-        (None, (Event.BUS_OFF, None, True)),
+        (Restart.ITSELF, None),
+        (After(2.5), (Event.SILENT, 2.5, True)),  # the pause is that of the configuration, not the back-off's
+        (Restart.NEVER, (Event.BUS_OFF, None, True)),
     ],
 )
-def test_what_bus_off_leads_to(restart_s: float | None, verdict: tuple[object, ...] | None) -> None:
+def test_what_bus_off_leads_to(restart: Restart | After, verdict: tuple[object, ...] | None) -> None:
     bus = SimpleNamespace(interface="socketcan", channel="vcan0")
-    config: Any = SimpleNamespace(channel=SimpleNamespace(restart_s=restart_s), bus=bus)
-    found = Recovery(config, cast("Any", None)).off("bus-off")
+    config: Any = SimpleNamespace(channel=SimpleNamespace(restart=restart), bus=bus)
+    found = Recovery(config, cast("Any", None)).bus_off("bus-off")
     assert (found and (found.event, found.pause_s, found.off_bus)) == verdict
     assert found is None or found.reason.startswith("bus-off; ")
 
