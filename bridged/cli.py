@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bridged import VERSION
-from bridged.errors import BridgeError, ConfigError
+from bridged.errors import BridgeError, BusError, ConfigError
 from bridged.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bridged.settings import Config
+    from bridged.interfaces.base import Bus
+    from bridged.settings import BusConfig, Config
 
 EX_CONFIG = 78  # sysexits.h
 WATCH_INTERVAL_S = 1.0
@@ -35,10 +36,12 @@ CANNOT_WRITE = "cannot write to the standard output: {}"
 
 def config_path(name: str) -> Path:
     """A file, or the NAME of one in /etc/can-bridge."""
-    path = Path(name)
-    if "/" in name or path.suffix in {".yaml", ".yml"} or os.path.isfile(name):  # noqa: PTH113 - False, whatever the name
-        return path
-    return CONFIG_DIRECTORY / f"{name}.yaml"
+    return Path(name) if _is_file(name) else CONFIG_DIRECTORY / f"{name}.yaml"
+
+
+def _is_file(name: str) -> bool:
+    """Whether it names a file by its path, there or not."""
+    return "/" in name or Path(name).suffix in {".yaml", ".yml"} or os.path.isfile(name)  # noqa: PTH113 - False, whatever the name
 
 
 def _load(name: str) -> Config:
@@ -88,8 +91,10 @@ def _run(args: argparse.Namespace) -> int:
     from bridged.daemon.service import Service, hangup_means_reload  # noqa: PLC0415
     from bridged.daemon.status import StatusServer, own_socket_path  # noqa: PLC0415
     from bridged.daemon.status_text import farewell  # noqa: PLC0415
+    from bridged.interfaces import open_bus  # noqa: PLC0415
 
     config = _load(args.config)
+    open_interface = _opened_as(args.user, config.bus) if args.user else open_bus
     notifier = systemd_notifier()
     fields = start_logging(config.name, verbose=args.verbose)
     log = logging.getLogger(__name__)
@@ -107,7 +112,8 @@ def _run(args: argparse.Namespace) -> int:
     def snapshot() -> dict[str, Any]:
         return {"version": VERSION, **service.bridge.snapshot()}  # of the present one
 
-    service = Service(Bridge(config, memory), notifier, successor if hangup_means_reload() else None)
+    first = Bridge(config, memory, open_interface=open_interface)
+    service = Service(first, notifier, successor if hangup_means_reload() else None)
     fields.state = lambda: service.bridge.state.value
     status = StatusServer(args.socket or own_socket_path(config.name), snapshot)
     gc.freeze()  # what is loaded stays
@@ -118,6 +124,48 @@ def _run(args: argparse.Namespace) -> int:
     finally:
         status.close()
     log.info("%s", farewell(snapshot()))
+    return 0
+
+
+def _opened_as(user: str, bus: BusConfig) -> Callable[..., Bus]:
+    """Becomes `user`; before that opens the interface: it takes root to make it, and to enlarge its buffer.
+
+    The function returned gives the open interface, or the error, when it is called the first time.
+    """
+    from bridged.daemon.privileges import become  # noqa: PLC0415
+    from bridged.interfaces import open_bus  # noqa: PLC0415
+
+    opened: list[Bus | BusError] = []
+    if bus.interface == "socketcan":  # python-can's need no privilege, and may have threads
+        try:
+            opened.append(open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options))
+        except BusError as error:
+            opened.append(error)
+    become(user)
+
+    def open_interface(*arguments: Any, **options: Any) -> Bus:
+        if not opened:
+            return open_bus(*arguments, **options)
+        found = opened.pop()
+        if isinstance(found, BusError):
+            raise found
+        return found
+
+    return open_interface
+
+
+def _interface(args: argparse.Namespace) -> int:
+    channel = args.name
+    if _is_file(args.name) or config_path(args.name).is_file():
+        config = _load(args.name)
+        channel = config.bus.channel
+        if not config.bus.create:
+            print(f"{channel}: not made, since {config.path} does not say create: true")
+            return 0
+    from bridged.interfaces.socketcan import make_interface  # noqa: PLC0415
+
+    made = make_interface(channel)
+    print(f"{printable(channel)}: {'is up' if made else 'was up before'}")
     return 0
 
 
@@ -189,13 +237,13 @@ def _ask(args: argparse.Namespace) -> tuple[str, bool]:
     """What to show, and whether all bridges that were asked run."""
     import json  # noqa: PLC0415
 
-    from bridged.daemon.status import NotRunningError, StatusError, is_running, query  # noqa: PLC0415
+    from bridged.daemon.status import NotRunningError, StatusError, is_running  # noqa: PLC0415
     from bridged.daemon.status_text import render, render_short  # noqa: PLC0415
 
     paths = _status_paths(args)
     if len(paths) == 1:
         try:
-            status = query(paths[0])
+            status = _query(paths[0])
         except NotRunningError as error:
             if args.socket:
                 raise
@@ -205,7 +253,7 @@ def _ask(args: argparse.Namespace) -> tuple[str, bool]:
     lines, all_run = [], True
     for path in paths:
         try:
-            status = query(path)
+            status = _query(path)
             lines.append(json.dumps(status) if args.json else render_short(status))
             all_run = all_run and is_running(status)
         except StatusError as error:
@@ -215,6 +263,24 @@ def _ask(args: argparse.Namespace) -> tuple[str, bool]:
             else:
                 lines.append(printable(f"{path.stem}: {error}"))
     return "\n".join(lines), all_run
+
+
+def _query(path: Path) -> dict[str, Any]:
+    """As query(); root of a container that has few capabilities asks as the socket's owner, if need be."""
+    from bridged.daemon.status import StatusError, query  # noqa: PLC0415
+
+    try:
+        return query(path)
+    except StatusError as error:
+        if os.geteuid() != 0 or not isinstance(error.__cause__, PermissionError):
+            raise
+        from bridged.daemon.privileges import acting_as_owner  # noqa: PLC0415
+
+        try:
+            with acting_as_owner(path):
+                return query(path)
+        except OSError:
+            raise error from None
 
 
 def _status(args: argparse.Namespace) -> int:
@@ -230,12 +296,12 @@ def _status(args: argparse.Namespace) -> int:
 def _probe(args: argparse.Namespace) -> int:
     """One line for each bridge; 0: it holds for all, 1: not for one that answers, 3: one does not answer."""
     from bridged.daemon.probes import answer  # noqa: PLC0415
-    from bridged.daemon.status import StatusError, query  # noqa: PLC0415
+    from bridged.daemon.status import StatusError  # noqa: PLC0415
 
     statuses = {0}
     for path in _status_paths(args):
         try:
-            holds, line = answer(args.check, query(path))
+            holds, line = answer(args.check, _query(path))
         except StatusError as error:
             line = printable(f"{path.stem}: not {args.check}: {error}")
             statuses.add(EXIT_NOT_RUNNING)
@@ -313,7 +379,25 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         help="where the status socket is made; default: /run/can-bridge/NAME.sock for root, "
         "$XDG_RUNTIME_DIR/can-bridge/NAME.sock for others",
     )
+    run.add_argument(
+        "--user",
+        metavar="USER",
+        help="a name or a number: as root, make and open the interface, then become this user and keep no "
+        "privilege (for a container that starts as root)",
+    )
     run.add_argument("--verbose", action="store_true", help="log details (debugging)")
+
+    interface = add(
+        "interface",
+        "Make a virtual CAN interface, bring it up, and end; needs CAP_NET_ADMIN only.",
+        _interface,
+    )
+    interface.add_argument(
+        "name",
+        metavar="INTERFACE|FILE|NAME",
+        help="its name, such as vcan0; or a configuration, as for run: its interface is made if the file "
+        "says create: true",
+    )
 
     check = add(
         "check", "Check configurations; exit status 78 if one cannot be used, 0 also with warnings.", _check

@@ -24,8 +24,13 @@ def runtime_directory() -> Path:
 
 
 def runtime_directories() -> set[Path]:
-    """Where status sockets may be that this user can ask: root's directory, and this user's if it is safe."""
+    """Where status sockets may be that this user can ask: root's directory, and this user's if it is safe.
+
+    For root also what XDG_RUNTIME_DIR says: a bridge that has given root up (`run --user`) follows it.
+    """
     folders = {SYSTEM_RUNTIME}
+    if os.geteuid() == 0 and (base := os.environ.get("XDG_RUNTIME_DIR")):
+        folders.add(Path(base) / "can-bridge")
     with contextlib.suppress(OSError):
         if not distrust(runtime_directory().lstat()):
             folders.add(runtime_directory())

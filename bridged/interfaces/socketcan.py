@@ -92,6 +92,13 @@ def open_socketcan(channel: str, create: bool) -> SocketcanBus:
     return SocketcanBus(channel, sock, warning)
 
 
+def make_interface(channel: str) -> bool:
+    """Make the vcan `channel` if there is none and bring it up; False: it was up before. Raises BusError."""
+    was_up = is_up(channel)
+    open_socketcan(channel, create=True).close()
+    return not was_up
+
+
 def is_up(channel: str) -> bool:
     """Whether there is such an interface, and it is up."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as any_socket:  # netdevice(7): any will do
@@ -194,8 +201,8 @@ def _create_vcan(channel: str) -> None:
     cause = OSError(code, os.strerror(code))
     if code in {errno.EPERM, errno.EACCES}:
         raise BusError(
-            f"{channel}: creating it needs root or CAP_NET_ADMIN: as root, `ip link add dev {channel} type "
-            f"vcan` and `ip link set {channel} up`, or AmbientCapabilities=CAP_NET_ADMIN in the service"
+            f"{channel}: creating it needs CAP_NET_ADMIN: `can-bridge interface {channel}` as root, in a "
+            "container as uid 0 with --cap-add NET_ADMIN; in the service AmbientCapabilities=CAP_NET_ADMIN"
         ) from cause
     if code == errno.EOPNOTSUPP:
         raise BusError(

@@ -14,8 +14,11 @@ from typing import Any
 import pytest
 from benches.status_socket import serving, snapshot
 
-from bridged import VERSION, cli
-from bridged.daemon import directories, status_text
+from bridged import VERSION, cli, interfaces
+from bridged.daemon import directories, privileges, status_text
+from bridged.errors import BusError
+from bridged.interfaces import socketcan
+from bridged.settings import BusConfig
 
 CONFIG = """\
 adapter: {type: can232, port: /nowhere/tty, baudrate: 115200}
@@ -29,6 +32,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The directory of the status sockets, of root's bridges and ours."""
     monkeypatch.setattr(directories, "SYSTEM_RUNTIME", tmp_path)
     monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     return tmp_path
 
 
@@ -160,6 +164,83 @@ class TestStatus:
         monkeypatch.setattr(sys.stdout, "fileno", lambda: 1, raising=False)
         text = cli._fitted(status_text.render(snapshot(state="waiting", reason="there is no tty")))
         assert text.splitlines() == ["can232: waiting, up ", "9 s", "  reason      there "]
+
+
+class TestInterface:
+    """`can-bridge interface`; that it makes one: tests/system/test_privileges.py."""
+
+    @pytest.fixture
+    def made(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+        names: list[str] = []
+
+        def make(channel: str) -> bool:
+            names.append(channel)
+            return len(names) == 1
+
+        monkeypatch.setattr(socketcan, "make_interface", make)
+        return names
+
+    def test_by_its_name(self, configs: Path, made: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+        assert [cli.main(["interface", "vcan7"]) for _ in range(2)] == [0, 0]
+        assert (made, capsys.readouterr().out) == (["vcan7"] * 2, "vcan7: is up\nvcan7: was up before\n")
+        assert cli.main(["interface", str(configs / "vcan7.yaml")]) == 78  # a file that is not there
+        assert made == ["vcan7"] * 2
+
+    @pytest.mark.parametrize("create", [True, False])
+    def test_by_a_configuration(
+        self, configs: Path, made: list[str], capsys: pytest.CaptureFixture[str], create: bool
+    ) -> None:
+        file = configs / "can232.yaml"
+        bus = f"{{channel: vcan7, create: {str(create).lower()}}}"
+        file.write_text(CONFIG.replace("{interface: virtual, channel: a}", bus))
+        for name in ("can232", str(file)):
+            assert cli.main(["interface", name]) == 0
+        assert made == ["vcan7"] * 2 * create
+        if not create:
+            line = f"vcan7: not made, since {file} does not say create: true\n"
+            assert capsys.readouterr().out == line * 2
+
+    def test_one_that_cannot_be(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["interface", "vcan 7"]) == 1
+        assert capsys.readouterr().err.startswith("can-bridge: 'vcan 7' is no name of an interface")
+
+
+class TestUser:
+    """`run --user`: the interface is opened before root is given up, once."""
+
+    BUS = BusConfig(channel="vcan0", create=True)
+
+    def opened(
+        self, monkeypatch: pytest.MonkeyPatch, found: list[Any]
+    ) -> tuple[Callable[..., Any], list[str]]:
+        done: list[str] = []
+
+        def open_bus(*_arguments: Any, **options: Any) -> Any:
+            done.append(f"create={options['create']}")
+            one = found.pop(0)
+            if isinstance(one, BusError):
+                raise one
+            return one
+
+        monkeypatch.setattr(interfaces, "open_bus", open_bus)
+        monkeypatch.setattr(privileges, "become", lambda user: done.append(f"become {user}"))
+        return cli._opened_as("65532", self.BUS), done
+
+    def test_the_first_is_open_already(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        open_interface, done = self.opened(monkeypatch, ["first", "second"])
+        assert done == ["create=True", "become 65532"]
+        assert [open_interface("socketcan", "vcan0", create=False, options={}) for _ in range(2)] == [
+            "first",
+            "second",
+        ]
+        assert done[2:] == ["create=False"]
+
+    def test_an_error_is_told_by_the_bridge(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        open_interface, done = self.opened(monkeypatch, [BusError("vcan0: no"), "second"])
+        assert done == ["create=True", "become 65532"]
+        with pytest.raises(BusError, match="vcan0: no"):
+            open_interface("socketcan", "vcan0", create=True, options={})
+        assert open_interface("socketcan", "vcan0", create=True, options={}) == "second"
 
 
 class TestProbes:

@@ -12,12 +12,14 @@ from bridged.daemon import directories
 
 def test_where_the_status_sockets_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     user = os.geteuid() or 1000
-    monkeypatch.setattr(os, "geteuid", lambda: 0)
-    assert directories.runtime_directory() == Path("/run/can-bridge")
-    assert directories.runtime_directories() == {Path("/run/can-bridge")}
-    monkeypatch.setattr(os, "geteuid", lambda: user)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     own = tmp_path / "can-bridge"
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    assert directories.runtime_directories() == {Path("/run/can-bridge")}
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert directories.runtime_directory() == Path("/run/can-bridge")
+    assert directories.runtime_directories() == {Path("/run/can-bridge"), own}  # of `run --user`
+    monkeypatch.setattr(os, "geteuid", lambda: user)
     assert directories.runtime_directory() == own
     assert directories.runtime_directories() == {Path("/run/can-bridge")}  # it does not exist
     own.mkdir(mode=0o755)

@@ -40,7 +40,7 @@ class TestSocketcan:
         [
             (
                 errno.EPERM,
-                r"as root, `ip link add dev vcan0 type vcan` and `ip link set vcan0 up`, or Ambient",
+                r"`can-bridge interface vcan0` as root, in a container as uid 0 with --cap-add NET_ADMIN",
             ),
             (errno.EOPNOTSUPP, "this kernel has no vcan: try `modprobe vcan`"),
             (errno.ENOMEM, "cannot be made: Cannot allocate memory"),
