@@ -331,7 +331,7 @@ class Chip:
         wait_until(lambda: self.usb is None and self.tty is None, f"{self.name} to be gone")
 
     def plug(self) -> None:
-        """Plug it in again, and wait for its terminal."""
+        """Plug it in again. Its terminal follows, unless a bridge takes the chip from the kernel's driver."""
         ask_monitor(
             "device_add",
             driver="usb-serial",
@@ -340,7 +340,7 @@ class Chip:
             serial=self.serial_number,
             **{"always-plugged": True},
         )
-        self.wait_tty()
+        wait_until(lambda: self.usb, f"{self.name} to be plugged in")
 
     def restore(self) -> None:
         """Plugged in, with the kernel's driver: a bridge that was killed has not given it back."""
@@ -348,8 +348,9 @@ class Chip:
         if usb is None:
             self.plug()
         elif self.tty is None:
-            Path("/sys/bus/usb/drivers_probe").write_text(f"{usb.name}:1.0")
-            self.wait_tty()
+            with contextlib.suppress(OSError):  # just plugged in: the kernel has not looked at it yet, and will
+                Path("/sys/bus/usb/drivers_probe").write_text(f"{usb.name}:1.0")
+        self.wait_tty()
 
 
 def ask_monitor(command: str, **arguments: Any) -> Any:

@@ -161,7 +161,8 @@ class TestQemusChip:
         with pytest.raises(PortError, match=r"no such USB device|does not exist"):
             open_port(port.description, 57600)
         chip.plug()
-        port = open_port(address if raw else str(chip.tty), 57600)
+        tty = chip.wait_tty()
+        port = open_port(address if raw else str(tty), 57600)
         assert port.serial_number == chip.serial_number
         port.close()
         chip.wait_tty()
