@@ -1,8 +1,11 @@
 """Procedures of questions and pauses; the tests of the bridge have them with an adapter."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
-from bridged.adapters.base import Reply, Steps, pause
+from bridged import _relay
+from bridged.adapters.base import Exchange, Reply, Steps, pause
 from bridged.bridge.exchanges import Exchanges
 from bridged.bridge.lifecycle import Event, Verdict
 
@@ -33,3 +36,22 @@ def test_a_pause_that_is_forgotten_ends_nothing() -> None:
     exchanges.forget()
     assert exchanges.on_timer(math.inf) is None
     assert exchanges.next_at is None
+
+
+def test_frames_are_wanted_before_the_step_that_opens_the_channel_is_sent() -> None:
+    """The first of them may come with its answer."""
+    said: list[object] = []
+    relay: Any = SimpleNamespace(
+        set_gates=lambda *, receiving, transmit: said.append((receiving, transmit)),
+        command=lambda _token, request, *_rest, more: said.append((request, more)),
+    )
+    exchanges = Exchanges(relay)
+
+    def steps() -> Steps:
+        yield Exchange(b"S4", "set", (Reply.OK,))
+        yield Exchange(b"O", "open", (Reply.OK,), opens=True)
+
+    exchanges.run(steps(), Event.READY)
+    assert said == [(b"S4", False)]
+    exchanges.answer(_relay.EVENT_OK, 1, b"")
+    assert said[1:] == [(True, _relay.GATE_AWAY), (b"O", False)]
