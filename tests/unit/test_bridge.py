@@ -201,9 +201,11 @@ def test_silence_is_told_then_ends(bench: Bench, caplog: pytest.LogCaptureFixtur
 def test_pulled_out_and_plugged_in_again(bench: Bench) -> None:
     bench.plug_in(Can232(time.monotonic()))
     bridge = started(bench.bridge())
+    run_until(bridge, lambda: bridge.snapshot()["bus_state"] == "error-active")
     bench.pull_out()
     run_until(bridge, lambda: bridge.state is State.BACKOFF)
     assert "lost" in bridge.reason
+    assert bridge.snapshot()["bus_state"] is None  # nobody tells any more
     bench.bus.far.send(FRAME.pack(1, 0, b""))
     run_until(bridge, lambda: bridge.snapshot()["counters"]["tx_dropped"]["adapter-away"] == 1)
     bench.plug_in(Can232(time.monotonic()))

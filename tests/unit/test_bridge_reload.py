@@ -140,6 +140,20 @@ def test_a_stop_meanwhile_counts_the_frames_that_wait(bench: Bench) -> None:
     assert stopped(old)["counters"]["tx_dropped"]["stopped"] == 3
 
 
+def test_a_stop_does_not_wait_for_frames_that_were_to_be_sent_before_a_reload(bench: Bench) -> None:
+    old = started(bench.bridge("bitrate: 10000", "{deadline: 60}"))
+    for _ in range(100):
+        bench.bus.far.send(FRAME.pack(1, 8, b""))
+    run_until(old, lambda: old.snapshot()["queued"] > 50)
+    new = bench.bridge(transmit="{window: 2}")
+    old.stop(new.config)
+    assert old.state is State.RUNNING
+    new.close()
+    old.stop()
+    assert old.state is State.STOPPING
+    assert stopped(old)["counters"]["tx_dropped"]["stopped"] > 0
+
+
 def test_frames_of_the_adapter_go_on_while_its_channel_is_closed(bench: Bench) -> None:
     """Only what comes from the bus waits."""
     bench.pull_out()

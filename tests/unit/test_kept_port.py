@@ -232,6 +232,21 @@ def test_another_bridge_sends_the_rest_of_a_frame_that_the_port_took_a_part_of()
     assert resumed == [(b"a message", 3)]
 
 
+def test_the_rest_of_a_frame_is_for_no_device_that_comes_after_it() -> None:
+    resumed: list[tuple[object, ...]] = []
+    relay: Any = SimpleNamespace(
+        cut=lambda: (True, b"a message", 3), resume=lambda *rest: resumed.append(rest)
+    )
+    near, far = socket.socketpair()
+    port: Any = SimpleNamespace(fd=near.fileno(), close=near.close)
+    kept = KeptPort(relay)
+    far.close()
+    kept.release(port)
+    assert kept.take() is None
+    kept.resume()
+    assert resumed == []
+
+
 @pytest.mark.parametrize("ends", [socket.socket.close, lambda far: far.shutdown(socket.SHUT_RDWR)])
 def test_a_port_that_has_come_to_its_end_is_not_kept(ends: Callable[[socket.socket], None]) -> None:
     with rig_with() as rig:

@@ -257,6 +257,26 @@ class TestSignals:
             with pytest.raises(BlockingIOError):
                 os.read(reader, 1)
 
+    def test_a_reload_is_compared_with_the_configuration_that_would_come(self) -> None:
+        """Or a file that is what it was would be no change, and the bridge between would come after all."""
+        bridge: Any = SimpleNamespace(
+            config="first", state=State.RUNNING, stop=lambda *_: None, adopt=lambda _: False
+        )
+        compared: list[object] = []
+        closed: list[object] = []
+
+        def successor(present: Any) -> Any:
+            compared.append(present)
+            config = "second" if present == "first" else "first"
+            return SimpleNamespace(config=config, close=lambda: closed.append(config))
+
+        running = Service(bridge, None, successor)
+        with service._signals() as (reader, came):
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGHUP)
+                running._on_signals(reader, came)
+        assert (compared, closed) == (["first", "second"], ["second"])
+
     def test_a_stop_comes_first_also_if_its_number_finds_no_place(
         self, made: tuple[Service, list[str]]
     ) -> None:
