@@ -50,9 +50,10 @@ bus:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `can-bridge demo`."""
-    first = next(iter(SIMULATORS))
+    driven = [name for name in SIMULATORS if simulator(name).ADAPTER]
+    first = driven[0]
     parser.add_argument(
-        "adapter", nargs="?", choices=list(SIMULATORS), default=first, help=f"which one; default: {first}"
+        "adapter", nargs="?", choices=driven, default=first, help=f"which one; default: {first}"
     )
     parser.add_argument("--duration", type=positive, default=10.0, metavar="SECONDS", help="default: 10")
     parser.add_argument(

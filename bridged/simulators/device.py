@@ -2,7 +2,7 @@
 
 To add one: a file in this directory with all of `SimulatorModule`, and a line in SIMULATORS (__init__.py).
 `can-bridge simulate`, `can-bridge demo` and the tests that run over all simulators (tests/unit/
-test_simulator_contract.py) take it from there. can232.py is an example. A clone may subclass the device of
+test_simulator_contract.py, test_adapter_contract.py) take it from there. can232.py is an example. A clone may subclass the device of
 another file, and take that file's options and faults as they are.
 
 Rules:
@@ -47,8 +47,8 @@ class SimulatorModule(Protocol):
     """Maker and product, for the list in `can-bridge simulate --help`."""
 
     ADAPTER: Mapping[str, str | int]
-    """The keys of `adapter` in a bridge's configuration that go with this device, all but `port`; `baudrate`
-    is left out: who sets `--uart-rate` knows it."""
+    """The keys of `adapter` in a bridge's configuration that go with this device, without `port`, and without
+    `baudrate`, which who sets `--uart-rate` knows. Empty: no type of adapter drives it yet."""
 
     FAULTS: Mapping[str, OwnFault]
     """By name, letters and at most one digit at the end; also the `own_faults` of the device."""

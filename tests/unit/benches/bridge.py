@@ -1,5 +1,7 @@
 """A bridge, relay and adapter on a simulated device behind a real pty; only the interface is a socketpair."""
 
+import contextlib
+import json
 import os
 import select
 import socket
@@ -12,13 +14,15 @@ from typing import Any
 
 from books import check_books
 
+from bridged.adapters.base import Exchange, Steps
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
 from bridged.config import load
 from bridged.daemon.eeprom_store import FileMemory
 from bridged.ports import open_port
 from bridged.ports.watch import Watch
-from bridged.simulators.can232 import Can232
+from bridged.simulators import make_device, simulator
+from bridged.simulators.device import Device
 from bridged.simulators.ends import pack
 from bridged.simulators.serve import Fault, Simulator
 from bridged.simulators.sja1000 import Frame
@@ -64,15 +68,18 @@ class Bench:
         self._simulator: Simulator | None = None
         self._thread: threading.Thread | None = None
 
-    def plug_in(self, device: Can232, *, faults: tuple[Fault, ...] = (), traffic_fps: float = 0.0) -> None:
-        self.device = device
-        self._simulator = Simulator(
-            device, link=self.link, on_frame=self.frames.append, faults=faults, traffic_fps=traffic_fps
-        )
+    def plug_in(self, device: Device, **options: Any) -> None:
+        """`options` of the Simulator."""
+        self.device: Any = device
+        self._simulator = Simulator(device, link=self.link, on_frame=self.frames.append, **options)
         self._thread = threading.Thread(target=self._simulator.run)
         self._thread.start()
         while not self.link.exists():
             os.sched_yield()
+
+    def befall(self, fault: Fault) -> None:
+        assert self._simulator
+        self._simulator.begin(fault)
 
     def pull_out(self) -> None:
         if self._simulator and self._thread:
@@ -123,6 +130,68 @@ class Bench:
         self.pull_out()
         self.bus.close()
         self.bus.far.close()
+
+
+class ContractBench(Bench):
+    """Any simulator of the registry, and the type of adapter that goes with it."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        super().__init__(folder)
+        self.name = name
+        self.link = folder / "device"
+        self.asked: list[Exchange] = []  # the steps of all initialisations and closings
+        self._ends = [*socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)]
+
+    def new_device(self) -> Device:
+        return make_device(self.name)
+
+    def plug_in(self, device: Device, **options: Any) -> None:
+        super().plug_in(device, bus=self._ends[0], **options)
+
+    def bridge(self, **_options: object) -> Bridge:
+        """One after the other, each with an interface of its own. Steps that are asked for are in `asked`."""
+        self.bus.close()
+        self.bus.far.close()
+        self.bus = PairBus()
+        path = self.folder / "bench.yaml"
+        serial = {"baudrate": 1_000_000} if hasattr(self.new_device(), "uart") else {}
+        config = {
+            "adapter": {**simulator(self.name).ADAPTER, "port": str(self.link), **serial},
+            "channel": {"bitrate": 500_000},
+            "health": {"interval": 0.1},
+            "bus": {"channel": "vcan0"},
+            "reconnect": {"initial": 0.01, "maximum": 0.01},
+            "transmit": {"deadline": LIMIT_S},
+        }
+        path.write_text(json.dumps(config))
+        bridge = self.bridge_of(path)
+        adapter = bridge.adapter
+        adapter.init_steps, adapter.close_steps = map(self._noted, (adapter.init_steps, adapter.close_steps))  # type: ignore[method-assign]
+        return bridge
+
+    def _noted(self, procedure: Callable[..., Steps]) -> Callable[..., Steps]:
+        def noted(*arguments: Any) -> Steps:
+            steps = procedure(*arguments)
+            with contextlib.suppress(StopIteration):
+                exchange = next(steps)
+                while True:
+                    self.asked.append(exchange)
+                    exchange = steps.send((yield exchange))
+
+        return noted
+
+    def send(self, *frames: Frame) -> None:
+        for frame in frames:
+            self.bus.far.send(pack(frame))
+
+    def send_from_its_bus(self, *frames: Frame) -> None:
+        for frame in frames:
+            self._ends[1].send(pack(frame))
+
+    def close(self) -> None:
+        super().close()
+        for end in self._ends:
+            end.close()
 
 
 class Usb2canBench(Bench):
