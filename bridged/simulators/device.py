@@ -2,8 +2,8 @@
 
 To add one: a file in this directory with all of `SimulatorModule`, and a line in SIMULATORS (__init__.py).
 `can-bridge simulate`, `can-bridge demo` and the tests that run over all simulators (tests/unit/
-test_simulator_contract.py, test_adapter_contract.py) take it from there. can232.py is an example. A clone may subclass the device of
-another file, and take that file's options and faults as they are.
+test_simulator_contract.py, test_adapter_contract.py) take it from there. can232.py is an example. A clone
+may subclass the device of another file, and take that file's options and faults as they are.
 
 Rules:
 - A device does no I/O and has no clock of its own: each method is told the time, in seconds of a clock that
