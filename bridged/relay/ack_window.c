@@ -1,7 +1,7 @@
 /* The window of a device that answers each frame.
  *
  * A refusal (BELL, say) says that the device did not take the frame, so that a retry cannot put the frame on the
- * bus twice. Three exceptions: noise that looks like a refusal; a second answer to the frame before (slcanpty);
+ * bus twice. Three exceptions: noise that looks like a refusal; a second answer to the frame before;
  * a resynchronisation in progress, where the refusal may mean the sync command, spliced to a broken one.
  * Hence:
  * - After a refusal the sync command goes first. If the frame's confirmation comes before the sync command's answer,

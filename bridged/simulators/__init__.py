@@ -18,6 +18,17 @@ if TYPE_CHECKING:
 SIMULATORS: Final = {
     "can232": "bridged.simulators.can232",
     "usb2can": "bridged.simulators.usb2can",
+    "canable1": "bridged.simulators.canable1",
+    "canable2": "bridged.simulators.canable2",
+    "cantact": "bridged.simulators.cantact",
+    "catompiler": "bridged.simulators.catompiler",
+    "elmue": "bridged.simulators.elmue",
+    "esp32": "bridged.simulators.esp32",
+    "nakakiyo": "bridged.simulators.nakakiyo",
+    "slcanpty": "bridged.simulators.slcanpty",
+    "slcanuino": "bridged.simulators.slcanuino",
+    "usbtin": "bridged.simulators.usbtin",
+    "weact": "bridged.simulators.weact",
 }
 """ADAPTER in `can-bridge simulate ADAPTER` → its module, loaded only when it is needed."""
 

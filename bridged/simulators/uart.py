@@ -62,6 +62,11 @@ class Uart:
         """Characters that the host has written and that have not yet arrived."""
         return sum(len(data) for _, data in self._bursts) if self._bursts else 0
 
+    @property
+    def device_backlog(self) -> int:
+        """Characters that the device has said and that the host has not got."""
+        return sum(len(data) for _, data in self._messages)
+
     def host_writes(self, at: float, data: bytes, device_clock: float) -> None:
         """Queue what the host wrote, seen at `at`; `device_clock` is what the device has lived through."""
         if not data:
