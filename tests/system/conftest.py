@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from containers import Containers, prepare
 from rig import Rig
 
 
@@ -23,5 +24,13 @@ def real_kernel() -> None:
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
     made = Rig(tmp_path)
+    yield made
+    made.clear()
+
+
+@pytest.fixture
+def containers(tmp_path: Path) -> Iterator[Containers]:
+    prepare()
+    made = Containers(tmp_path)
     yield made
     made.clear()

@@ -21,9 +21,11 @@ suite=bookworm
 packages=systemd,systemd-sysv,udev,dbus,kmod,procps,iproute2,can-utils,busybox-static,strace
 packages=$packages,python3,python3-can,python3-serial,python3-yaml,python3-usb,python3-systemd
 packages=$packages,python3-pytest,python3-pytest-timeout
+# For the container tests; the images come on a disk of their own (tests/container/image.sh).
+packages=$packages,podman,crun,catatonit,uidmap
 
 # What of the kernel's modules goes in: CAN, serial lines, USB, and what the virtual machine itself stands on.
-module_trees="arch crypto lib net fs/ext4 fs/jbd2 fs/mbcache.ko fs/9p fs/fscache fs/netfs fs/autofs fs/configfs fs/fuse
+module_trees="arch crypto lib net fs/ext4 fs/jbd2 fs/mbcache.ko fs/9p fs/fscache fs/netfs fs/autofs fs/configfs fs/fuse fs/overlayfs
     drivers/net/can drivers/tty drivers/usb drivers/virtio drivers/block drivers/char drivers/hid"
 
 # Loaded by the initial RAM disk: what it takes to see the root file system and a console.

@@ -1,12 +1,13 @@
 #!/bin/sh
 # Boots the virtual machine, runs one command in it as root with the repository in /repo, and returns its exit status.
 #
-#   run.sh [-t SECONDS] [-k DIRECTORY] [-o OVERLAY] COMMAND    COMMAND is a line for bash
-#   run.sh [-o OVERLAY] -i                                     a shell to look around in; Ctrl-D ends it
+#   run.sh [-t SECONDS] [-k DIRECTORY] [-o OVERLAY] [-d DISK] COMMAND    COMMAND is a line for bash
+#   run.sh [-o OVERLAY] [-d DISK] -i                                     a shell to look around in; Ctrl-D ends it
 #
 #   -t  give up after so long (1800)
 #   -k  keep here what the command left in /ctl, with journal.txt and serial.log
 #   -o  a directory laid over the guest's /
+#   -d  a disk image, to read only, /dev/vdb in the guest
 #
 # The machine has two FTDI chips, FT245 to look at. The far end of ftdi0 (serial number RIG0001) is the socket ftdi0.sock in the
 # host's side of /ctl, for a simulator there (hostside.py starts it when the guest asks); that of ftdi1 (RIG0002) is
@@ -20,18 +21,19 @@ set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
 top=$(cd "$here/../../.." && pwd)
-limit=1800 keep='' overlay='' interactive=''
-while getopts t:k:o:i option; do
+limit=1800 keep='' overlay='' disk='' interactive=''
+while getopts t:k:o:d:i option; do
     case $option in
         t) limit=$OPTARG ;;
         k) keep=$OPTARG ;;
         o) overlay=$OPTARG ;;
+        d) disk=$OPTARG ;;
         i) interactive=1 limit=0 ;;
         *) exit 2 ;;
     esac
 done
 shift $((OPTIND - 1))
-[ -n "$interactive" ] || [ $# -gt 0 ] || { echo "usage: run.sh [-t SECONDS] [-k DIRECTORY] [-o OVERLAY] -i | COMMAND" >&2; exit 2; }
+[ -n "$interactive" ] || [ $# -gt 0 ] || { echo "usage: run.sh [-t SECONDS] [-k DIRECTORY] [-o OVERLAY] [-d DISK] -i | COMMAND" >&2; exit 2; }
 
 image=$(sh "$here/build.sh" --where)
 case $image in /*) ;; *) image=$PWD/$image ;; esac
@@ -85,6 +87,7 @@ status=0
     -kernel "$image/vmlinux" -initrd "$image/initrd.img" \
     -append "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off nokaslr audit=0 tsc=reliable no_timer_check systemd.show_status=0 random.trust_cpu=on" \
     -drive "file=$image/root.ext4,if=none,id=root,format=raw,snapshot=on,cache=unsafe" -device virtio-blk-pci,drive=root \
+    ${disk:+-drive "file=$disk,if=none,id=disk,format=raw,readonly=on" -device virtio-blk-pci,drive=disk} \
     -chardev "file,id=serial,path=serial.log" -serial chardev:serial \
     -device virtio-serial-pci -chardev stdio,id=console,signal=off -device virtconsole,chardev=console \
     -fsdev local,id=ctl,path=.,security_model=none -device virtio-9p-pci,fsdev=ctl,mount_tag=ctl \
