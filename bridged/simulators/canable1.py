@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "CANable 1 with canable-fw"
-ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
+ADAPTER: Final[Mapping[str, str | int]] = {}
 FAULTS = slcan.FAULTS
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "CANtact"
-ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
+ADAPTER: Final[Mapping[str, str | int]] = {}
 FAULTS = slcan.FAULTS
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "ESP32 with esp32-slcan"
-ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
+ADAPTER: Final[Mapping[str, str | int]] = {}
 FAULTS = slcan.FAULTS
 
 DEAF_S = 1.0  # after power-on

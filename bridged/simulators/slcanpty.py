@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "slcanpty of can-utils"
-ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
+ADAPTER: Final[Mapping[str, str | int]] = {}
 FAULTS = slcan.FAULTS
 
 

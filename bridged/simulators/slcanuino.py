@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bridged.simulators.sja1000 import Frame
 
 TITLE = "Arduino with slcanuino"
-ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
+ADAPTER: Final[Mapping[str, str | int]] = {}
 FAULTS = slcan.FAULTS
 
 UART_ROOM = 64

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from bridged.simulators.sja1000 import Frame
 
 TITLE = "USBtin 1.4"
-ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
+ADAPTER: Final[Mapping[str, str | int]] = {}
 FAULTS = slcan.FAULTS
 
 USB_ROOM = 128
