@@ -2,8 +2,8 @@
 
 The images are on a disk of their own, which podman reads as an additional store: nothing is unpacked. What
 containers write is in memory. `./dev test system` builds the images and gives the machine the disk where all
-tests or something with "container" in its name is asked for (-k container), `./dev vm run` where the images of
-the present sources are built already (`./dev image`). The fixture `containers` makes and clears them:
+tests or something with "container" in its name is asked for (-k container), `./dev vm run` where the images
+of the present sources are built already (`./dev image`). The fixture `containers` makes and clears them:
 
     def test_started_without_its_adapter(containers):
         pod = containers.pod()                                     # a network namespace of its own

@@ -348,7 +348,7 @@ class Chip:
         if usb is None:
             self.plug()
         elif self.tty is None:
-            with contextlib.suppress(OSError):  # just plugged in: the kernel has not looked at it yet, and will
+            with contextlib.suppress(OSError):  # just plugged in: the kernel has yet to look at it, and will
                 Path("/sys/bus/usb/drivers_probe").write_text(f"{usb.name}:1.0")
         self.wait_tty()
 
