@@ -37,7 +37,11 @@ from bridged.yaml_source import (
 )
 
 LONG_DEADLINE_S = 10.0
-# --- The schema. A description completes "expected …, got the text 'fast'". ----------------------
+# --- The schema ---------------------------------------------------------------------------------
+# A description completes "expected …, got the text 'fast'". A new key is: its type and its place in a struct
+# here (of one adapter: in adapters/), a value in settings.py, a line in the function that reads the section,
+# and its line in config/*.yaml. A reload that changes it reopens the adapter, unless Bridge.reconfigure() can
+# go on with it.
 
 Flag = Annotated[bool, Meta(description="true or false")]
 Bitrate = Annotated[

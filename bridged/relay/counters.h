@@ -1,8 +1,9 @@
 /* The lists of the relay's counters, of its reasons to drop a frame, and of its events for Python.
  *
  * A new one is a line in one of these lists: X(NAME, "its name in Python", "what it means").
- * The enumerators, the struct, Python's constants and the keys of counters() come from them, and a test holds the
- * stub (_relay.pyi) against them. */
+ * The enumerators, the struct, Python's constants and the keys of counters() come from them. Tests hold the stub
+ * (_relay.pyi) against the events, and README.md (What the counters mean) against the reasons why a frame was not
+ * sent. What drops a frame calls queue_drop() or receive_drop(). */
 #ifndef CAN_BRIDGE_COUNTERS_H
 #define CAN_BRIDGE_COUNTERS_H
 

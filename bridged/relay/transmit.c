@@ -189,7 +189,15 @@ void transmit_poll(struct transmit *t, const struct command *poll, int64_t inter
     t->poll_at_ns = 0;
 }
 
-/* --- missing answers ------------------------------------------------------------------------- */
+/* --- missing answers -------------------------------------------------------------------------
+ *
+ * A frame whose answer does not come in time stays the oldest in flight (keeps_its_place()), and the sync command is
+ * sent behind it; nothing else goes until that is answered. Answers come in order, so:
+ * - "done" before the sync command's answer is the frame's, late (what a refusal means then: ack_window.c);
+ * - the sync command's answer says that the frame's is lost: the frame may be on the bus, so it is not sent again but
+ *   dropped as `unanswered`;
+ * - no answer to SYNC_TRIES sync commands: all in flight is dropped so, and EVENT_SILENT lets Python begin anew.
+ * A device that answers no frame (CONFIRMS_LEVEL) is asked for its fill level instead: level_window.c. */
 
 static int resync(struct transmit *t, int64_t now)
 {

@@ -65,4 +65,4 @@ def test_every_reason_is_explained() -> None:
     reasons = relay.counters()["tx_dropped"]
     assert isinstance(reasons, dict)
     for reason in (*reasons, LOST_BEFORE_READ[0]):
-        assert f"`{reason}`" in README, reason
+        assert f"`{reason}`" in README, f"README.md, `tx_dropped` reasons: what is `{reason}`?"

@@ -431,3 +431,45 @@ def test_time_stamps_are_told_again_of_a_new_port(rig: Rig) -> None:
         rig.turn()
         assert [kind for kind, _, _ in rig.events()].count(_relay.EVENT_STAMPED) == 1
         rig.attach()
+
+
+def test_after_a_resynchronisation_a_refusal_before_it_needs_no_check_of_its_own() -> None:
+    with rig_with(window=2) as rig:
+        for n in range(2):
+            rig.bus.send(can_frame(n))
+        rig.turn()
+        assert len(rig.said()) == 2
+        rig.port.send(b"\a")
+        rig.turn()
+        rig.turn(301)  # the other is not answered
+        assert rig.said() == [b"V"]
+        rig.bus.send(can_frame(2))
+        rig.port.send(b"V1324\r")
+        rig.turn()
+        assert [number_of(line) for line in rig.said()] == [2]
+        c = rig.counters()
+        assert (c["unanswered"], c["resyncs"]) == (2, 1)
+
+
+def test_a_line_that_a_port_did_not_end_does_not_go_on_at_the_next_port(rig: Rig) -> None:
+    rig.port.send(b"x" * 200)
+    rig.turn()
+    rig.relay.detach_port()
+    rig.attach()
+    rig.port.send(b"t1230\r")
+    rig.turn()
+    assert rig.frames() == [FRAME.pack(0x123, 0, b"")]
+
+
+def test_an_interface_that_takes_little_by_little_loses_nothing(rig: Rig) -> None:
+    """Only one that takes nothing at all for 0.1 s does."""
+    rig.far[1].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    frames = [FRAME.pack(n, 0, b"") for n in range(64)]
+    rig.port.send(b"".join(b"t%03X0\r" % n for n in range(64)))
+    rig.turn()
+    got = []
+    while len(got) < len(frames):
+        rig.turn(40)
+        got.append(rig.bus.recv(128))
+    assert got == frames
+    rig.counters()

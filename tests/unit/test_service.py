@@ -260,7 +260,7 @@ class TestSignals:
     def test_a_reload_is_compared_with_the_configuration_that_would_come(self) -> None:
         """Or a file that is what it was would be no change, and the bridge between would come after all."""
         bridge: Any = SimpleNamespace(
-            config="first", state=State.RUNNING, stop=lambda *_: None, adopt=lambda _: False
+            config="first", state=State.RUNNING, stop=lambda *_: None, reconfigure=lambda _: False
         )
         compared: list[object] = []
         closed: list[object] = []
