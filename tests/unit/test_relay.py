@@ -452,7 +452,7 @@ def test_after_a_resynchronisation_a_refusal_before_it_needs_no_check_of_its_own
 
 
 def test_a_line_that_a_port_did_not_end_does_not_go_on_at_the_next_port(rig: Rig) -> None:
-    rig.port.send(b"x" * 200)
+    rig.port.send(b"x" * 1000)
     rig.turn()
     rig.relay.detach_port()
     rig.attach()
