@@ -29,6 +29,7 @@ WATCH_INTERVAL_S = 1.0
 EXIT_NOT_RUNNING = 3  # as systemctl status
 PROBES = ("started", "ready", "live")  # see daemon/probes.py
 CONFIG_DIRECTORY = Path("/etc/can-bridge")
+DEFAULT_NAME = "can-bridge"  # of a configuration
 HELP_WIDTH = 98
 OUTPUT_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 CANNOT_WRITE = "cannot write to the standard output: {}"
@@ -47,15 +48,20 @@ def _is_file(name: str) -> bool:
 def _load(name: str) -> Config:
     from bridged.config import load  # noqa: PLC0415 - 20 ms that `status` need not pay
 
-    return load(_existing(name))
+    return load(_existing(name), os.environ)
 
 
 def _existing(name: str) -> Path:
-    """The path of a configuration; if there is none, ConfigError with the one that is probably meant."""
+    """The path of a configuration; if there is none, ConfigError with the one that is probably meant.
+
+    Where the environment has settings, there need be no file.
+    """
     path = config_path(name)
     try:
         path.stat()
     except FileNotFoundError:
+        if _variables():
+            return path
         near = [path.with_suffix(suffix) for suffix in (".yaml", ".yml")]
         near += [path.with_name(f"{path.name}.yaml"), CONFIG_DIRECTORY / f"{path.stem}.yaml"]
         found = next((str(file) for file in near if file.is_file()), None)
@@ -66,6 +72,18 @@ def _existing(name: str) -> Path:
     except OSError:  # reading says why
         pass
     return path
+
+
+def _variables() -> list[str]:
+    """The names of the environment variables that are settings."""
+    from bridged.environment import variables  # noqa: PLC0415 - as above
+
+    return variables(os.environ)
+
+
+def _source(path: Path) -> str:
+    """Where a configuration comes from, for the user."""
+    return ", ".join([*[str(path)] * path.exists(), *_variables()])
 
 
 def _import_msgspec() -> None:
@@ -101,7 +119,7 @@ def _run(args: argparse.Namespace) -> int:
     adapter, bus = config.adapter, config.bus
     log.info(
         "can-bridge %s: %s: %s on %s to %s %s",
-        VERSION, config.path, adapter.type, adapter.port, bus.interface, bus.channel,
+        VERSION, _source(config.path), adapter.type, adapter.port, bus.interface, bus.channel,
     )  # fmt: skip
     memory = FileMemory(state_directory())
 
@@ -156,11 +174,11 @@ def _opened_as(user: str, bus: BusConfig) -> Callable[..., Bus]:
 
 def _interface(args: argparse.Namespace) -> int:
     channel = args.name
-    if _is_file(args.name) or config_path(args.name).is_file():
-        config = _load(args.name)
+    if channel is None or _is_file(channel) or config_path(channel).is_file():
+        config = _load(channel or DEFAULT_NAME)
         channel = config.bus.channel
         if not config.bus.create:
-            print(f"{channel}: not made, since {config.path} does not say create: true")
+            print(f"{channel}: not made, since {printable(_source(config.path))} does not say create: true")
             return 0
     from bridged.interfaces.socketcan import make_interface  # noqa: PLC0415
 
@@ -170,7 +188,11 @@ def _interface(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    names = args.config or sorted(map(str, CONFIG_DIRECTORY.glob("*.yaml")))
+    names = (
+        args.config
+        or sorted(map(str, CONFIG_DIRECTORY.glob("*.yaml")))
+        or [DEFAULT_NAME] * bool(_variables())
+    )
     if not names:
         raise ConfigError([f"{CONFIG_DIRECTORY}: there is no configuration, NAME.yaml: name a file"])
     problems: list[str] = []
@@ -187,12 +209,12 @@ def _check(args: argparse.Namespace) -> int:
 def _check_one(path: Path) -> None:
     from bridged.config import check  # noqa: PLC0415 - as above
 
-    config, warnings = check(path)
+    config, warnings = check(path, os.environ)
     for warning in warnings:
         print(printable(warning), file=sys.stderr)
     adapter, channel, bus = config.adapter, config.channel, config.bus
     print(
-        f"{printable(str(config.path))}: OK: {adapter.type} on {adapter.where}, "
+        f"{printable(_source(config.path))}: OK: {adapter.type} on {adapter.where}, "
         f"{channel.timing.description}{', listen-only' if channel.listen_only else ''}, "
         f"to {bus.interface} {bus.channel}"
     )
@@ -370,7 +392,12 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
 
     run = add("run", "Run the bridge of a configuration in the foreground.", _run)
     run.add_argument(
-        "config", metavar="FILE|NAME", help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml"
+        "config",
+        nargs="?",
+        default=DEFAULT_NAME,
+        metavar="FILE|NAME",
+        help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml; default: {DEFAULT_NAME}; none is needed "
+        "where the environment has all: CAN_BRIDGE__ADAPTER__PORT is the key port of section adapter",
     )
     run.add_argument(
         "--socket",
@@ -394,6 +421,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     )
     interface.add_argument(
         "name",
+        nargs="?",
         metavar="INTERFACE|FILE|NAME",
         help="its name, such as vcan0; or a configuration, as for run: its interface is made if the file "
         "says create: true",

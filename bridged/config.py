@@ -3,7 +3,7 @@
 import functools
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -12,6 +12,8 @@ from msgspec import Meta, Struct
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bridged import adapters, can
+from bridged.environment import overlay, variables
+from bridged.errors import ConfigError
 from bridged.ports.names import PortName
 from bridged.settings import (
     AdapterConfig,
@@ -37,6 +39,7 @@ from bridged.yaml_source import (
 )
 
 LONG_DEADLINE_S = 10.0
+NOTHING: Mapping[str, str] = {}
 # --- The schema ---------------------------------------------------------------------------------
 # A description completes "expected …, got the text 'fast'". A new key is: its type and its place in a struct
 # here (of one adapter: in adapters/), a value in settings.py, a line in the function that reads the section,
@@ -146,17 +149,20 @@ _RESERVED_OPTIONS = {
 """Keyword arguments of can.Bus that are not for the user."""
 
 
-def load(path: str | os.PathLike[str]) -> Config:
-    """Return the configuration in a file; ConfigError with all problems, each with line and column."""
-    return _load(Path(path))[0]
+def load(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING) -> Config:
+    """Return the configuration in a file and in environment variables; with these there need be no file.
+
+    ConfigError with all problems, each with line and column.
+    """
+    return _load(Path(path), environment)[0]
 
 
-def check(path: str | os.PathLike[str]) -> tuple[Config, list[str]]:
+def check(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING) -> tuple[Config, list[str]]:
     """Return what load() does, and a line for each thing that is allowed but probably not meant.
 
     ConfigError also where python-can lacks what the interface needs, which takes importing it.
     """
-    config, top = _load(Path(path))
+    config, top = _load(Path(path), environment)
     adapter, transmit = config.adapter, config.transmit
     section = top.section("adapter")
     if section and PortName(adapter.port).is_numbered_terminal:
@@ -192,10 +198,14 @@ def _check_python_can(section: Section, bus: BusConfig) -> None:
             (section.refuse_key if refused else section.warn_key)(key, text)
 
 
-def _load(file: Path) -> tuple[Config, Section]:
-    path = str(file)
-    problems = Problems(path)
-    root = parse(read_text(file, problems), problems)
+def _load(file: Path, environment: Mapping[str, str]) -> tuple[Config, Section]:
+    problems = Problems(str(file))
+    if variables(environment) and _is_missing(file):
+        root = overlay(None, environment, problems)
+        only = [f"{file}: there is no such file: the environment is all there is"]
+    else:
+        root = overlay(parse(read_text(file, problems), problems), environment, problems)
+        only = []
     if not isinstance(root, MappingNode) or foreign_tag(root):
         empty = root is None or is_empty(root)
         what = "the file is empty" if empty else "the file is no mapping (a 'key: value' in each line)"
@@ -205,8 +215,18 @@ def _load(file: Path) -> tuple[Config, Section]:
     top = Section(root, _schemas, problems)
     config = _read_file(file, top)
     if config is None:
-        raise problems.error()
+        raise ConfigError([*only, *problems.error().problems])
     return config, top
+
+
+def _is_missing(file: Path) -> bool:
+    try:
+        file.stat()
+    except FileNotFoundError:
+        return True
+    except OSError:  # reading says why
+        pass
+    return False
 
 
 def _read_file(path: Path, top: Section) -> Config | None:

@@ -31,9 +31,12 @@ Schemas = Callable[[], Mapping[str, "type[Struct]"]]
 MAX_BYTES = 65_536
 """Far above any configuration; keeps a wrong path (/dev/zero, a log file) from being read to its end."""
 
-_CORE = "tag:yaml.org,2002:"
+VARIABLE_PREFIX = "CAN_BRIDGE__"
+"""Of environment variables that stand for keys: see environment.py."""
+
+CORE = "tag:yaml.org,2002:"
 _KNOWN_TAGS = frozenset(
-    _CORE + name
+    CORE + name
     for name in ("str", "int", "float", "bool", "null", "timestamp", "value", "merge", "seq", "map")
 )
 _BOOLEANS = {"yes": True, "no": False, "true": True, "false": False, "on": True, "off": False}
@@ -52,36 +55,42 @@ _EXPLANATIONS = (
 
 
 class Problems:
-    """What is wrong with a file, each with its place."""
+    """What is wrong with a file and with environment variables, each with its place."""
 
     def __init__(self, file: str) -> None:
         self._file = file
-        self._found: list[tuple[int, int, str]] = []
-        self._doubts: list[tuple[int, int, str]] = []
+        self._found: list[tuple[str, int, int, str]] = []
+        self._doubts: list[tuple[str, int, int, str]] = []
 
     def warn_at(self, node: Node, text: str) -> None:
         """Add what is allowed, but probably not meant."""
-        self._doubts.append((node.start_mark.line + 1, node.start_mark.column + 1, text))
+        mark = node.start_mark
+        self._doubts.append((mark.name, mark.line, mark.column, text))
 
-    def add(self, line: int, column: int, text: str) -> None:
-        """Add a problem; line and column from 0, as YAML marks count them."""
-        self._found.append((line + 1, column + 1, text))
+    def add(self, line: int, column: int, text: str, variable: str = "") -> None:
+        """Add a problem of the file or of a variable; line and column from 0, as YAML marks count them."""
+        self._found.append((variable, line, column, text))
 
     def add_at(self, node: Node, text: str) -> None:
         """Add a problem at the beginning of a node."""
-        self.add(node.start_mark.line, node.start_mark.column, text)
+        self.add(node.start_mark.line, node.start_mark.column, text, node.start_mark.name)
 
     def error(self) -> ConfigError:
-        """All of them in the order of the file, `FILE:LINE:COLUMN: text` each."""
+        """All of them in the order of the file, `FILE:LINE:COLUMN: text` each; then `VARIABLE: text`."""
         return ConfigError(self._lines(self._found))
 
     def warnings(self) -> list[str]:
         """What was added by warn_at(), in the same form."""
         return self._lines(self._doubts)
 
-    def _lines(self, found: list[tuple[int, int, str]]) -> list[str]:
-        ordered = sorted(found, key=lambda problem: problem[:2])
-        return [f"{self._file}:{line}:{column}: {text}" for line, column, text in ordered]
+    def _lines(self, found: list[tuple[str, int, int, str]]) -> list[str]:
+        ordered = sorted(found, key=lambda problem: problem[:3])
+        return [f"{self._place(variable, line, column)}: {text}" for variable, line, column, text in ordered]
+
+    def _place(self, variable: str, line: int, column: int) -> str:
+        if variable and line == column == 0:
+            return variable
+        return f"{variable or self._file}:{line + 1}:{column + 1}"
 
     def __bool__(self) -> bool:
         return bool(self._found)
@@ -109,8 +118,10 @@ def read_text(path: Path, problems: Problems) -> str:
         raise problems.error() from error
 
 
-def parse(text: str, problems: Problems) -> Node | None:
+def parse(text: str, problems: Problems, variable: str = "") -> Node | None:
     """Return the root of a document, None if there is none; ConfigError if it is not YAML.
+
+    The marks of its nodes bear the name of the variable that it is the value of; none: it is the file's.
 
     By the loader in Python: the one in C is 1 ms faster for a file of 20 lines, words its errors in another
     way, and ends the process when a file nests deeply.
@@ -118,25 +129,29 @@ def parse(text: str, problems: Problems) -> Node | None:
     loader: yaml.SafeLoader | None = None
     try:
         loader = yaml.SafeLoader(text)
+        loader.name = variable
         return loader.get_single_node()
     except ReaderError as error:
         line_start = text.rfind("\n", 0, error.position) + 1
         line = text.count("\n", 0, error.position)
         character = f"U+{ord(text[error.position]):04X}"
-        problems.add(
-            line, error.position - line_start, f"not valid YAML: character {character} is not allowed"
-        )
+        what = f"character {character} is not allowed"
+        problems.add(line, error.position - line_start, f"not valid YAML: {what}", variable)
         raise problems.error() from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = error.problem or "syntax error"
         what = next((f"{hint} ({problem})" for start, hint in _EXPLANATIONS if start in problem), problem)
-        problems.add(mark.line if mark else 0, mark.column if mark else 0, f"not valid YAML: {what}")
+        problems.add(
+            mark.line if mark else 0, mark.column if mark else 0, f"not valid YAML: {what}", variable
+        )
         raise problems.error() from error
     except (ValueError, OverflowError, RecursionError) as error:  # PyYAML lets through "\UFFFFFFFF", many "["
         mark = loader.get_mark() if loader else None
         what = "nested too deeply" if isinstance(error, RecursionError) else "a number is out of range"
-        problems.add(mark.line if mark else 0, mark.column if mark else 0, f"not valid YAML: {what}")
+        problems.add(
+            mark.line if mark else 0, mark.column if mark else 0, f"not valid YAML: {what}", variable
+        )
         raise problems.error() from error
 
 
@@ -144,12 +159,12 @@ def foreign_tag(node: Node) -> str | None:
     """Return a tag that means nothing here, as it was written: `!!python/name:os.system`, `!secret`."""
     if node.tag in _KNOWN_TAGS:
         return None
-    return quoted(re.sub(f"^{_CORE}", "!!", node.tag))
+    return quoted(re.sub(f"^{CORE}", "!!", node.tag))
 
 
 def is_empty(node: Node) -> bool:
     """True for `key:`, `key: ~` and `key: null`."""
-    return node.tag == f"{_CORE}null"
+    return node.tag == f"{CORE}null"
 
 
 def scalar_value(node: ScalarNode) -> object:
@@ -159,7 +174,7 @@ def scalar_value(node: ScalarNode) -> object:
     """
     text: str = node.value
     try:
-        match node.tag.removeprefix(_CORE):
+        match node.tag.removeprefix(CORE):
             case "null":
                 return None
             case "bool":
@@ -265,7 +280,9 @@ class Section:
 
     def refuse_missing(self, key: str, wanted: str) -> None:
         """Report that a key is not there."""
-        self.problems.add_at(self._parent, f"{self._where(key)}: is missing; expected {wanted}")
+        variable = f"{VARIABLE_PREFIX}{self._below(key).replace('.', '__').upper()}"
+        hint = f" ({variable})" if self._parent.start_mark.name else ""
+        self.problems.add_at(self._parent, f"{self._where(key)}: is missing{hint}; expected {wanted}")
 
     def refuse_unknown(self, allowed: list[str]) -> None:
         """Report each key that is not allowed here, and what was probably meant."""

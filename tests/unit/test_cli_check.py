@@ -131,3 +131,31 @@ def test_who_may_not_read_it(
     monkeypatch.setattr(Path, "open", refuse)
     assert cli.main(["check", "a"]) == 78
     assert capsys.readouterr().err == f"{etc}/a.yaml: cannot be read: Permission denied (by user nobody)\n"
+
+
+def test_the_environment(
+    etc: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over a file; alone, where there is none; and named where it is wrong."""
+    monkeypatch.setenv("CAN_BRIDGE__CHANNEL__BITRATE", "500000")
+    file = next(iter(sorted(etc.glob("*.yaml"))))
+    assert cli.main(["check", str(file)]) == 0
+    assert f"{file}, CAN_BRIDGE__CHANNEL__BITRATE: OK: " in (out := capsys.readouterr().out)
+    assert "500000 bit/s" in out
+    for path in etc.glob("*.yaml"):
+        path.unlink()
+    for name, value in {"ADAPTER": "{type: can232, port: /dev/ttyUSB0}", "BUS__CHANNEL": "vcan0"}.items():
+        monkeypatch.setenv(f"CAN_BRIDGE__{name}", value)
+    assert cli.main(["check"]) == 0
+    names = "CAN_BRIDGE__ADAPTER, CAN_BRIDGE__BUS__CHANNEL, CAN_BRIDGE__CHANNEL__BITRATE"
+    assert capsys.readouterr().out.startswith(f"{names}: OK: can232 on /dev/ttyUSB0")
+    assert cli.main(["interface"]) == 0
+    assert capsys.readouterr().out == f"vcan0: not made, since {names} does not say create: true\n"
+    monkeypatch.setenv("CAN_BRIDGE__BUS__CREATE", "perhaps")
+    assert cli.main(["check"]) == 78
+    out, err = capsys.readouterr()
+    assert (out, err.splitlines()[0]) == (
+        "",
+        f"{etc}/can-bridge.yaml: there is no such file: the environment is all there is",
+    )
+    assert "\nCAN_BRIDGE__BUS__CREATE: bus.create: expected true or false, got the text 'perhaps'\n" in err

@@ -1,7 +1,9 @@
 """What the README says: its configuration loads, its commands exist, its texts are the program's own."""
 
+import os
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,17 @@ def test_the_first_configuration_loads(tmp_path: Path) -> None:
     path = tmp_path / "can232.yaml"
     path.write_text(block)
     assert config.load(path).bus.create
+
+
+def test_the_configuration_without_a_file_loads(tmp_path: Path) -> None:
+    (block,) = [block for block in blocks("sh") if "CAN_BRIDGE__" in block]
+    script = block.replace("can-bridge run", "env")
+    lines = subprocess.run(
+        ["sh", "-euc", script], env={"PATH": os.environ["PATH"]}, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    loaded = config.load(tmp_path / "can-bridge.yaml", dict(line.split("=", 1) for line in lines))
+    assert loaded.bus.create
+    assert loaded.channel.acceptance is not None
 
 
 def test_every_command_is_one() -> None:
