@@ -50,11 +50,11 @@ LABEL org.opencontainers.image.title="can-bridge" \
     org.opencontainers.image.licenses="MIT"
 
 # The status socket, and what is known of the adapters' EEPROM: the two places that are written to, so that the root
-# file system can be read-only.
+# file system can be read-only. The bridge makes a directory of its own in each, whoever owns what is mounted there.
 ENV PATH=/opt/can-bridge/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
-    XDG_RUNTIME_DIR=/run \
-    STATE_DIRECTORY=/var/lib/can-bridge
+    XDG_RUNTIME_DIR=/run/can-bridge \
+    XDG_STATE_HOME=/var/lib/can-bridge
 VOLUME ["/run/can-bridge", "/var/lib/can-bridge"]
 USER 65532:65532
 # Started, not ready: an adapter that is not plugged in is no reason to hold back or to restart anything.
