@@ -83,7 +83,7 @@ def _variables() -> list[str]:
 
 def _source(path: Path) -> str:
     """Where a configuration comes from, for the user."""
-    return ", ".join([*[str(path)] * path.exists(), *_variables()])
+    return ", ".join([*[str(path)] * os.path.exists(path), *_variables()])  # noqa: PTH110 - False, whatever
 
 
 def _import_msgspec() -> None:
@@ -102,6 +102,7 @@ def _run(args: argparse.Namespace) -> int:
     _import_msgspec()
 
     from bridged.bridge.bridge import Bridge  # noqa: PLC0415
+    from bridged.daemon.config_map import MountedConfig  # noqa: PLC0415
     from bridged.daemon.directories import state_directory  # noqa: PLC0415
     from bridged.daemon.eeprom_store import FileMemory  # noqa: PLC0415
     from bridged.daemon.journal import start_logging  # noqa: PLC0415
@@ -111,6 +112,7 @@ def _run(args: argparse.Namespace) -> int:
     from bridged.daemon.status_text import farewell  # noqa: PLC0415
     from bridged.interfaces import open_bus  # noqa: PLC0415
 
+    mounted = MountedConfig(config_path(args.config))
     config = _load(args.config)
     open_interface = _opened_as(args.user, config.bus) if args.user else open_bus
     notifier = systemd_notifier()
@@ -131,7 +133,7 @@ def _run(args: argparse.Namespace) -> int:
         return {"version": VERSION, **service.bridge.snapshot()}  # of the present one
 
     first = Bridge(config, memory, open_interface=open_interface)
-    service = Service(first, notifier, successor if hangup_means_reload() else None)
+    service = Service(first, notifier, successor if hangup_means_reload() else None, mounted)
     fields.state = lambda: service.bridge.state.value
     status = StatusServer(args.socket or own_socket_path(config.name), snapshot)
     gc.freeze()  # what is loaded stays

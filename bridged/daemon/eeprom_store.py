@@ -6,6 +6,7 @@ EEPROM cells wear out, so a setting is written once and remembered by serial num
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import stat
@@ -21,10 +22,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FILE_MAX = 1 << 16  # bytes
+# A root that is read-only, no directory of ours: as somebody has decided, a container's image for one.
+NOT_TO_BE_HAD = {errno.EROFS, errno.EACCES}
 
 
 class FileMemory:
-    """One JSON file for each adapter. A file that cannot be read or written costs EEPROM writes, no more.
+    """One JSON file for each adapter. What cannot be written there is kept as long as this process lives.
+
+    So a setting that cannot be asked for is written to an EEPROM once in each process at most.
 
     Nothing is written in a directory that another user owns or may write in: that user could have root, or
     whoever runs the bridge, write somewhere else. Its files are read nevertheless, following no link.
@@ -32,18 +37,35 @@ class FileMemory:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
+        self._not_stored: dict[str, dict[str, int]] = {}
+        self._told = ""
 
     def recall(self, serial_number: str, setting: str) -> int | None:
-        return self._load(serial_number).get(setting)
+        return self._known(serial_number).get(setting)
 
     def remember(self, serial_number: str, setting: str, value: int) -> None:
+        known = self._known(serial_number)
+        if known.get(setting) == value:
+            return
+        known[setting] = value
         try:
-            self._store(serial_number, self._load(serial_number) | {setting: value})
+            self._store(serial_number, known)
         except OSError as error:
+            self._not_stored[serial_number] = known
             cause = f"{error.filename or self._directory}: {error.strerror or error}"
-            log.warning(
-                "cannot remember %s=%d, it will be written again at each start: %s", setting, value, cause
-            )
+            if cause != self._told:
+                self._told = cause
+                log.log(
+                    logging.INFO if error.errno in NOT_TO_BE_HAD else logging.WARNING,
+                    "what the adapter has stored (%s) is known until this process ends, since it cannot be "
+                    "remembered in %s; another place that lasts: STATE_DIRECTORY=PATH",
+                    setting, cause,
+                )  # fmt: skip
+        else:
+            self._not_stored.pop(serial_number, None)
+
+    def _known(self, serial_number: str) -> dict[str, int]:
+        return self._load(serial_number) | self._not_stored.get(serial_number, {})
 
     def _load(self, serial_number: str) -> dict[str, int]:
         import json  # noqa: PLC0415 - 2 ms, when the bridge is up already

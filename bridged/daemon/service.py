@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from bridged.bridge.bridge import Bridge
+    from bridged.daemon.config_map import MountedConfig
     from bridged.daemon.neighbours import Neighbours
     from bridged.daemon.status import StatusServer
     from bridged.settings import Config
@@ -82,15 +83,20 @@ class Service:
 
     The adapter of the old one is closed before the new one opens its own. The process, its counters, the
     status socket and, unless its section has changed, the open bus stay: frames sent meanwhile wait there
-    until the new adapter runs, or fails to.
+    until the new adapter runs, or fails to. What `mounted` finds changed is reloaded like that, too.
     """
 
     def __init__(
-        self, bridge: Bridge, notifier: Notifier | None = None, successor: Successor | None = None
+        self,
+        bridge: Bridge,
+        notifier: Notifier | None = None,
+        successor: Successor | None = None,
+        mounted: MountedConfig | None = None,
     ) -> None:
         self.bridge = bridge
         self._notifier = notifier or Notifier()
         self._make_successor = successor
+        self._mounted = mounted if successor else None
         self._successor: Bridge | None = None  # waits for the end of `bridge`
         self._ready_at: float | None = None  # what the service waits for is told by then; None: it was
         self._status = ""
@@ -128,8 +134,10 @@ class Service:
             selector.register(fd, selectors.EVENT_READ, self.bridge.on_readable)
 
     def _turn(self, selector: selectors.BaseSelector) -> None:
-        timers = [] if self.bridge.finished else [self.bridge.next_timer()]
-        timer = min((at for at in (*timers, self._feed_at, self._ready_at) if at is not None), default=None)
+        timers = [self._feed_at, self._ready_at, self._mounted.next_at if self._mounted else None]
+        if not self.bridge.finished:
+            timers.append(self.bridge.next_timer())
+        timer = min((at for at in timers if at is not None), default=None)
         timeout = None if timer is None else max(0.0, timer - time.monotonic())
         # One handler may serve several descriptors; it runs once.
         handlers: dict[Handler, None] = {key.data: None for key, _ in selector.select(timeout)}
@@ -139,6 +147,12 @@ class Service:
             self.bridge.on_timer(time.monotonic())
         self._feed(time.monotonic())
         self._look_around(time.monotonic())
+        self._look_at_configuration(time.monotonic())
+
+    def _look_at_configuration(self, now: float) -> None:
+        if self._mounted and self._make_successor and self._mounted.look(now):
+            log.info("the mounted configuration is another one: reloading")
+            self._reload(self._make_successor)
 
     def _look_around(self, now: float) -> None:
         if self._own_socket is None or self.bridge.finished:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
 from pathlib import Path
 
@@ -76,10 +78,38 @@ def test_nothing_is_written_where_another_user_is_the_owner(
     owner = directory.stat().st_uid
     monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
     made.remember(SERIAL, "W", 2)
-    assert made.recall(SERIAL, "W") == 1
-    assert (
-        f"cannot remember W=2, it will be written again at each start: {directory}: belongs to" in caplog.text
+    assert FileMemory(directory).recall(SERIAL, "W") == 1
+    assert f"is known until this process ends, since it cannot be remembered in {directory}: b" in caplog.text
+    assert caplog.records[-1].levelno == logging.WARNING
+
+
+def test_what_cannot_be_stored_is_known_in_this_process(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An adapter that comes and goes all night is not written to each time; a read-only root is no alarm."""
+    caplog.set_level(logging.INFO)
+    made = FileMemory(directory)
+    made.remember(SERIAL, "Z", 0)
+
+    def read_only(*_: object, **__: object) -> int:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), f"{SERIAL}.new")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", read_only)
+        for _ in range(3):
+            made.remember(SERIAL, "W", 1)
+            made.remember("B", "X", 1)
+        assert (made.recall(SERIAL, "W"), made.recall(SERIAL, "Z"), made.recall("B", "X")) == (1, 0, 1)
+        assert made.recall("C", "W") is None
+    (line,) = caplog.records
+    assert (line.levelno, line.getMessage()) == (
+        logging.INFO,
+        f"what the adapter has stored (W) is known until this process ends, since it cannot be remembered in "
+        f"{SERIAL}.new: Read-only file system; another place that lasts: STATE_DIRECTORY=PATH",
     )
+    made.remember(SERIAL, "W", 0)  # it can be written again, and all of it is
+    assert {setting: FileMemory(directory).recall(SERIAL, setting) for setting in "WZ"} == {"W": 0, "Z": 0}
+    assert made.recall(SERIAL, "W") == 0
 
 
 def test_nothing_is_written_where_others_may_write(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
