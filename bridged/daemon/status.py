@@ -13,7 +13,7 @@ it ran again; bus_off_restarts; tx_full, rx_overflow, arbitration_lost, bus_erro
 that it ever said); error_frames, error_frames_lost: those on the interface, and those that it did not take;
 error_frames_left_out: those that came too quickly one after the other, where the last one says it all;
 tx_discarded: of tx_frames, those that did not leave the adapter's own buffer for so long that it was emptied;
-tx_dropped, rx_dropped: {reason: frames}; …}, queued, uptime_s.
+tx_dropped, rx_dropped: {reason: frames}, by the reasons of relay/counters.h; …}, queued, uptime_s.
 At any moment bus_read = tx_frames + tx_queued + tx_unconfirmed + queued + tx_dropped (but for
 LOST_BEFORE_READ).
 """

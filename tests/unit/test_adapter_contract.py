@@ -159,7 +159,7 @@ def test_the_plug_pulled_amid_frames(bench: ContractBench) -> None:
     """Frames that waited go to the next device, young enough; those of the first are not sent again."""
     bench.plug_in(bench.new_device())
     bridge = started(bench.bridge())
-    frames = numbered(0x100, 200)
+    frames = numbered(0x100, 1000)  # so many that some still wait, however late the plug is pulled
     bench.send(*frames)
     run_until(bridge, lambda: len(bench.frames) >= 3)
     bench.pull_out()

@@ -208,10 +208,8 @@ def test_the_examples_show_every_key_and_the_defaults(file: Path, type_: str) ->
     sections = {**config._SECTIONS, "adapter": settings_of(type_)}
     for section, schema in sections.items():
         for key in key_names(schema):
-            assert re.search(rf"^ +(# )?({key}: |acceptance: .*\b{key}: )", text, re.MULTILINE), (
-                section,
-                key,
-            )
+            shows = re.search(rf"^ +(# )?({key}: |acceptance: .*\b{key}: )", text, re.MULTILINE)
+            assert shows, f"config/{type_}.yaml has no line, or comment, for {key} of {section}"
     shown = load(REPOSITORY / "config" / f"{type_}.yaml")
     file.write_text(four_lines(f"{{type: {type_}, port: /dev/ttyUSB0}}"))
     defaults = load(file)
@@ -640,7 +638,8 @@ def test_every_value_has_a_description() -> None:
     for schema in (*config._schemas().values(), *map(settings_of, TYPES)):
         for field in msgspec.structs.fields(schema):
             parts = [field.type, *get_args(field.type)]
-            described = any(getattr(part, "__metadata__", None) for part in parts)
+            metas = [meta for part in parts for meta in getattr(part, "__metadata__", ())]
+            described = any(meta.description for meta in metas)
             assert described or config._AcceptanceKeys in parts, f"{schema.__name__}.{field.name}"
 
 
