@@ -23,6 +23,8 @@ from bridged.errors import ConfigError
 from bridged.settings import After, BusConfig, ChannelConfig, Config, ReconnectConfig, Restart, TransmitConfig
 from bridged.yaml_source import key_names
 
+TYPE_NAMES = " or ".join(TYPES)
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -463,7 +465,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "4:11: transmit: is empty; expected a section with queue, window, deadline, or remove the key",
     ]),
     "empty sections": ("adapter: {}\nchannel: {}\nbus: {}\n", [
-        "1:1: adapter.type: is missing; expected can232 or usb2can",
+        f"1:1: adapter.type: is missing; expected {TYPE_NAMES}",
         f"1:1: adapter.port: is missing; {PORT}",
         "2:1: channel.bitrate: is missing; expected a bit rate in bit/s (or btr0 and btr1)",
         "3:1: bus.channel: is missing; expected the name of an interface",
@@ -515,7 +517,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     ]),
     "baudrate of usb2can": (usb2can("baudrate: fast"), ["1:40: adapter.baudrate: a USB2CAN has no baud rate, there is no serial line in it: remove it"]),
     "type": (four_lines("{type: can231, port: 'usb://1', baudrate: 49, ready_limit: 18, x: 1}"), [
-        "1:17: adapter.type: expected can232 or usb2can, got the text 'can231'",
+        f"1:17: adapter.type: expected {TYPE_NAMES}, got the text 'can231'",
         f"1:31: adapter.port: {USB} 'usb://1'",
         f"1:52: adapter.baudrate: {BAUDRATE}, got 49",
         f"1:69: adapter.ready_limit: {READY}, got 18",
@@ -527,7 +529,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "1:41: adapter.ready_limit: goes with type: usb2can; remove it",
     ]),
     "type, no text": (four_lines("{type: [usb2can], port: tcp://h}"), [
-        "1:17: adapter.type: expected can232 or usb2can, got a list",
+        f"1:17: adapter.type: expected {TYPE_NAMES}, got a list",
         "1:34: adapter.port: a raw TCP port is written 'socket://h'",
     ]),
     "type with a tag": (four_lines("{type: !x usb2can, port: /dev/x, baudrate: 1}"), [
@@ -535,7 +537,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
         "1:43: adapter.baudrate: a USB2CAN has no baud rate, there is no serial line in it: remove it",
     ]),
     "no type": (four_lines("{port: 'rfc2217://h:0'}"), [
-        "1:1: adapter.type: is missing; expected can232 or usb2can",
+        f"1:1: adapter.type: is missing; expected {TYPE_NAMES}",
         f"1:17: adapter.port: expected rfc2217://{URL} 'rfc2217://h:0'",
     ]),
     "usb2can without a port": (four_lines("{type: usb2can, ready_limit: 2, critical_limit: 2, serial_number: A}"), [
@@ -556,7 +558,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     ]),
     # combinations
     "several in a section": (four_lines("{type: can231, port: ttyUSB0, baudrate: 1.5}"), [
-        "1:17: adapter.type: expected can232 or usb2can, got the text 'can231'",
+        f"1:17: adapter.type: expected {TYPE_NAMES}, got the text 'can231'",
         "1:31: adapter.port: a device path begins with '/', such as /dev/ttyUSB0; 'ttyUSB0' does not",
         f"1:50: adapter.baudrate: {BAUDRATE}, got 1.5",
     ]),
