@@ -148,7 +148,7 @@ class ContractBench(Bench):
     def plug_in(self, device: Device, **options: Any) -> None:
         super().plug_in(device, bus=self._ends[0], **options)
 
-    def bridge(self, **_options: object) -> Bridge:
+    def bridge(self, *, bitrate: int = 500_000, **_options: object) -> Bridge:
         """One after the other, each with an interface of its own. Steps that are asked for are in `asked`."""
         self.bus.close()
         self.bus.far.close()
@@ -157,7 +157,7 @@ class ContractBench(Bench):
         serial = {"baudrate": 1_000_000} if hasattr(self.new_device(), "uart") else {}
         config = {
             "adapter": {**simulator(self.name).ADAPTER, "port": str(self.link), **serial},
-            "channel": {"bitrate": 500_000},
+            "channel": {"bitrate": bitrate},
             "health": {"interval": 0.1},
             "bus": {"channel": "vcan0"},
             "reconnect": {"initial": 0.01, "maximum": 0.01},
