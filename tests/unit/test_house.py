@@ -110,6 +110,44 @@ def test_no_circle() -> None:
         visit(module, ())
 
 
+# --- how much a class may hold ----------------------------------------------------------------
+
+DOZEN = 12
+# Classes that hold more, and why. An entry may shrink, and goes when its class has become small enough.
+LARGE = {
+    "adapters.can232.Can232": 16,  # what the commands of one family have told of the device
+    "adapters.usb2can.Usb2can": 14,  # the same
+    "simulators.can232.Can232": 15,  # the registers of a device
+    "simulators.usb2can_firmware.Firmware": 19,  # the same
+    "simulators.uart.Uart": 16,  # what is on the line in each direction, and counters for the benches
+    "simulators.serve.Simulator": 37,  # to be split: the device's ends, the agenda of its faults, its traffic
+}
+
+
+def attributes(class_: ast.ClassDef) -> set[str]:
+    """Those that __init__ assigns."""
+    inits = [node for node in class_.body if isinstance(node, ast.FunctionDef) and node.name == "__init__"]
+    return {
+        node.attr
+        for init in inits
+        for node in ast.walk(init)
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+        if isinstance(node.value, ast.Name) and node.value.id == "self"
+    }
+
+
+def test_a_class_holds_at_most_a_dozen_things() -> None:
+    found = {
+        f"{module}.{node.name}": len(attributes(node))
+        for module, tree in MODULES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    }
+    too_large = {name: n for name, n in found.items() if n > LARGE.get(name, DOZEN)}
+    assert not too_large, "split the class into parts that own what they do"
+    assert not {name for name in LARGE if found.get(name, 0) <= DOZEN}, "these are small enough now"
+
+
 # --- where an adapter's name may stand ---------------------------------------------------------
 
 NAMES = TYPES.keys() | SIMULATORS.keys()
