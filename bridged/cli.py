@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bridged import VERSION
-from bridged.errors import BridgeError, BusError, ConfigError
+from bridged.errors import BridgeError, ConfigError, InterfaceError
 from bridged.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bridged.interfaces.base import Bus
+    from bridged.interfaces.base import OpenInterface
     from bridged.settings import BusConfig, Config
 
 EX_CONFIG = 78  # sysexits.h
@@ -110,11 +110,11 @@ def _run(args: argparse.Namespace) -> int:
     from bridged.daemon.service import Service, hangup_means_reload  # noqa: PLC0415
     from bridged.daemon.status import StatusServer, own_socket_path  # noqa: PLC0415
     from bridged.daemon.status_text import farewell  # noqa: PLC0415
-    from bridged.interfaces import open_bus  # noqa: PLC0415
+    from bridged.interfaces import open_interface  # noqa: PLC0415
 
     mounted = MountedConfig(config_path(args.config))
     config = _load(args.config)
-    open_interface = _opened_as(args.user, config.bus) if args.user else open_bus
+    open_interface = _opened_as(args.user, config.bus) if args.user else open_interface
     notifier = systemd_notifier()
     fields = start_logging(config.name, verbose=args.verbose)
     log = logging.getLogger(__name__)
@@ -147,31 +147,31 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _opened_as(user: str, bus: BusConfig) -> Callable[..., Bus]:
+def _opened_as(user: str, bus: BusConfig) -> Callable[..., OpenInterface]:
     """Becomes `user`; before that opens the interface: it takes root to make it, and to enlarge its buffer.
 
     The function returned gives the open interface, or the error, when it is called the first time.
     """
     from bridged.daemon.privileges import become  # noqa: PLC0415
-    from bridged.interfaces import open_bus  # noqa: PLC0415
+    from bridged.interfaces import open_interface  # noqa: PLC0415
 
-    opened: list[Bus | BusError] = []
+    opened: list[OpenInterface | InterfaceError] = []
     if bus.interface == "socketcan":  # python-can's need no privilege, and may have threads
         try:
-            opened.append(open_bus(bus.interface, bus.channel, create=bus.create, options=bus.options))
-        except BusError as error:
+            opened.append(open_interface(bus.interface, bus.channel, create=bus.create, options=bus.options))
+        except InterfaceError as error:
             opened.append(error)
     become(user)
 
-    def open_interface(*arguments: Any, **options: Any) -> Bus:
+    def opened_before(*arguments: Any, **options: Any) -> OpenInterface:
         if not opened:
-            return open_bus(*arguments, **options)
+            return open_interface(*arguments, **options)
         found = opened.pop()
-        if isinstance(found, BusError):
+        if isinstance(found, InterfaceError):
             raise found
         return found
 
-    return open_interface
+    return opened_before
 
 
 def _interface(args: argparse.Namespace) -> int:

@@ -23,7 +23,7 @@ from bridged.bridge.bridge import Bridge
 from bridged.config import load
 from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.service import serve
-from bridged.errors import NO_CAN, BusError
+from bridged.errors import NO_CAN, InterfaceError
 from bridged.interfaces.socketcan import open_socketcan
 from bridged.simulators import SIMULATORS, make_device, simulator
 from bridged.simulators.options import positive
@@ -124,7 +124,7 @@ def _interface() -> tuple[str, str]:
     made = not Path("/sys/class/net", CHANNEL).exists()
     try:
         open_socketcan(CHANNEL, create=True).close()
-    except BusError as error:
+    except InterfaceError as error:
         cause = NO_CAN if str(error).startswith(NO_CAN) else error  # what helps is not for a demo
         print(f"# No {CHANNEL} here: {cause}.")
         print("# So the frames stay inside this process: python-can's interface 'virtual'.")

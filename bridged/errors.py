@@ -29,7 +29,7 @@ class WrongDeviceError(AdapterError):
     """The device answers, but is not the one that the configuration means; trying again soon is no use."""
 
 
-class BusError(BridgeError):
+class InterfaceError(BridgeError):
     """The CAN interface on the host's side could not be opened, made or used."""
 
 

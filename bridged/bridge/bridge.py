@@ -37,7 +37,7 @@ from bridged.bridge.port import AdapterPort
 from bridged.bridge.recovery import Recovery, stuck_s
 from bridged.bridge.snapshot import History, settle
 from bridged.can import BusState
-from bridged.interfaces import open_bus as open_any_interface
+from bridged.interfaces import open_interface as open_any_interface
 from bridged.ports import open_port as open_any_port
 from bridged.ports.watch import Watch
 from bridged.settings import Restart
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from bridged.adapters.base import Memory
     from bridged.bridge.exchanges import Found
-    from bridged.interfaces.base import Bus
+    from bridged.interfaces.base import OpenInterface
     from bridged.ports import Port
     from bridged.settings import Config
 
@@ -67,7 +67,7 @@ class Bridge:
     next_timer() has come (seconds of time.monotonic()), until `finished`.
 
     `open_port` gets the port and the baud rate, and is called in a thread of its own; `open_interface` gets
-    the settings of bridged.interfaces.open_bus(). `watch` tells when the port's device is plugged in.
+    the settings of bridged.interfaces.open_interface(). `watch` tells when the port's device is plugged in.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Bridge:
         memory: Memory,
         *,
         open_port: Callable[[str, int], Port] = open_any_port,
-        open_interface: Callable[..., Bus] = open_any_interface,
+        open_interface: Callable[..., OpenInterface] = open_any_interface,
         watch: Watch | None = None,
     ) -> None:
         self.config = config
@@ -128,18 +128,18 @@ class Bridge:
         its interface: frames that wait there are read once the adapter runs, or fails to.
         """
         self._loop.start()
-        bus = None
+        opened = None
         if predecessor is not None:
-            bus = predecessor._give_interface(self.config)
+            opened = predecessor._give_interface(self.config)
             self._port.take_over(predecessor._port)
             predecessor.close()
             self._history.continue_from(predecessor._history, predecessor.snapshot()["counters"])
-        if bus is None:
+        if opened is None:
             self._interface.open()
         else:
             self._hand_over.await_adapter()
             assert predecessor is not None
-            self._interface.use(bus, predecessor._interface.reason)
+            self._interface.use(opened, predecessor._interface.reason)
         self._start_with_interface()
 
     def stop(self, successor: Config | None = None) -> None:
@@ -237,7 +237,7 @@ class Bridge:
     def condition(self) -> tuple[State, str, bool]:
         """The state, the reason why it is not running, whether the interface is open."""
         reason = "; ".join(filter(None, (self.reason, self._interface.reason, self.circle)))
-        return self.state, reason, self._interface.bus is not None
+        return self.state, reason, self._interface.opened is not None
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""
@@ -282,7 +282,7 @@ class Bridge:
     # --- lifecycle ----------------------------------------------------------------------------
 
     def _start_with_interface(self) -> None:
-        if self.state is State.IDLE and self._interface.bus is not None:
+        if self.state is State.IDLE and self._interface.opened is not None:
             self._act_on(Verdict(Event.START))
 
     def _stop_when_sent(self, now: float) -> None:
@@ -290,7 +290,7 @@ class Bridge:
         if self._hand_over.may_stop(now, running=self.state is State.RUNNING):
             self._act_on(Verdict(Event.STOP))
 
-    def _give_interface(self, successor: Config) -> Bus | None:
+    def _give_interface(self, successor: Config) -> OpenInterface | None:
         """The open interface; None: it was lost, or the successor wants another."""
         if successor.bus != self.config.bus:
             return None

@@ -43,7 +43,7 @@ class Finding(NamedTuple):
 
 
 class Health:
-    """The state of the bus, from all observations; None: not known."""
+    """The state of the CAN bus, from all observations; None: not known."""
 
     def __init__(self) -> None:
         self.state: BusState | None = None
@@ -62,7 +62,7 @@ class Health:
         self.state = self.tec = self.rec = None
 
     def observe(self, seen: Observation, now_s: float) -> list[bytes]:
-        """Take it in; the error frames (struct can_frame) that tell the bus what is new."""
+        """Take it in; the error frames (struct can_frame) that tell the interface what is new."""
         frames: list[bytes] = []
         self.description = seen.description
         self._heard_s = now_s
@@ -138,7 +138,7 @@ class Stall:
         self._since_s: float | None = None
         self._looks = 0
         self._rx_frames = rx_frames
-        # As of the look before the last good one: what was taken since then may not be on the bus yet.
+        # As of the look before the last good one: what was taken since then may not be on the CAN bus yet.
         self._tx_left = self._tx_seen = tx_frames
 
     def observe(self, seen: Observation, now_s: float, rx_frames: int, tx_frames: int) -> bool:

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 from bridged.bridge.log_limiter import LogLimiter, repeated
 from bridged.can import CAN_ERR_BUSOFF, CRTL_RX_OVERFLOW, FRAME
-from bridged.errors import BusError
+from bridged.errors import InterfaceError
 from bridged.interfaces.base import LOST_ERROR_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bridged import _relay
-    from bridged.interfaces.base import Bus
+    from bridged.interfaces.base import OpenInterface
     from bridged.settings import Config
 
 log = logging.getLogger(__name__)
@@ -29,13 +29,15 @@ ERROR_FRAME_INTERVAL_S = 0.01
 
 
 class Interface:
-    """Keeps a bus open and attached to the relay, whatever becomes of the interface.
+    """Keeps an interface open and attached to the relay, whatever becomes of it.
 
     The owner calls on_timer() when `next_at` (seconds of time.monotonic()) has come.
     """
 
-    def __init__(self, config: Config, relay: _relay.Relay, open_interface: Callable[..., Bus]) -> None:
-        self.bus: Bus | None = None
+    def __init__(
+        self, config: Config, relay: _relay.Relay, open_interface: Callable[..., OpenInterface]
+    ) -> None:
+        self.opened: OpenInterface | None = None
         self.reason = ""  # why it is not open, or carries nothing
         self.retry_at: float | None = None  # the interface is looked for again then
         self._limit = ErrorFrameLimit()
@@ -44,34 +46,34 @@ class Interface:
         self._relay = relay
         self._open_interface = open_interface
         self._log_limiter = LogLimiter()
-        self._dropped_before: Counter[str] = Counter()  # on buses that were closed since
+        self._dropped_before: Counter[str] = Counter()  # by interfaces that were closed since
 
     def open(self) -> None:
         """Opens it, or tries again later."""
         wanted = self._config.bus
         try:
-            bus = self._open_interface(
+            opened = self._open_interface(
                 wanted.interface, wanted.channel, create=wanted.create, options=wanted.options
             )
-        except BusError as error:
+        except InterfaceError as error:
             self._not_open(str(error))
             return
-        self.use(bus)
-        if self.bus is None:
+        self.use(opened)
+        if self.opened is None:
             return
-        self._is_well(f"bus open: {bus.description}")
-        if bus.warning:
-            self.on_down(bus.warning)
+        self._is_well(f"bus open: {opened.description}")
+        if opened.warning:
+            self.on_down(opened.warning)
 
-    def use(self, bus: Bus, reason: str = "") -> None:
-        """An open bus, as that of a bridge that ended; `reason` why it carries nothing: it is down."""
+    def use(self, opened: OpenInterface, reason: str = "") -> None:
+        """An open interface, as that of a bridge that ended; `reason` why it carries nothing: it is down."""
         try:
-            self._relay.attach_interface(bus.fd)
+            self._relay.attach_interface(opened.fd)
         except OSError as error:  # no descriptor is left for it
-            self._not_open(f"{bus.description}: {error.strerror}")
-            bus.close()
+            self._not_open(f"{opened.description}: {error.strerror}")
+            opened.close()
             return
-        self.bus = bus
+        self.opened = opened
         if reason:
             self.reason = reason
             self.retry_at = time.monotonic() + RETRY_S
@@ -79,7 +81,7 @@ class Interface:
     @property
     def is_up(self) -> bool:
         """Whether it is open and carries frames."""
-        return self.bus is not None and not self.reason
+        return self.opened is not None and not self.reason
 
     def stop_trying(self) -> None:
         """An interface that is not open, or down, is not looked for any more."""
@@ -101,7 +103,7 @@ class Interface:
         if self.retry_at is None or now < self.retry_at:
             return False
         self.retry_at = None
-        if self.bus is None:
+        if self.opened is None:
             self.open()
         else:
             self._look()
@@ -109,17 +111,17 @@ class Interface:
 
     def on_lost(self, error: int) -> None:
         """The relay says so, with the errno of its last call or 0."""
-        if self.bus is None:
+        if self.opened is None:
             return
-        cause = self.bus.failure or (os.strerror(error) if error else "end of file")
+        cause = self.opened.failure or (os.strerror(error) if error else "end of file")
         hint = f" (was {self._config.bus.channel} deleted?)" if error in {errno.ENODEV, errno.ENXIO} else ""
-        self._fails(logging.ERROR, f"bus lost: {self.bus.description}: {cause}{hint}; opening it again")
+        self._fails(logging.ERROR, f"bus lost: {self.opened.description}: {cause}{hint}; opening it again")
         self.close()
         self.retry_at = time.monotonic()
 
     def on_down(self, warning: str = "") -> None:
         """The relay says so. The kernel does not tell when it is up again: that is looked for."""
-        if self.bus is None or self.retry_at is not None:
+        if self.opened is None or self.retry_at is not None:
             return
         channel = self._config.bus.channel
         self._fails(logging.WARNING, warning or f"interface {channel} is down: ip link set {channel} up")
@@ -127,11 +129,11 @@ class Interface:
 
     def snapshot(self) -> dict[str, object]:
         """For the status."""
-        bus = self._config.bus
+        wanted = self._config.bus
         return {
-            "interface": bus.interface,
-            "channel": bus.channel,
-            "open": self.bus is not None,
+            "interface": wanted.interface,
+            "channel": wanted.channel,
+            "open": self.opened is not None,
             "up": self.is_up,
         }
 
@@ -151,42 +153,42 @@ class Interface:
         }
 
     def _put(self, frames: list[bytes]) -> None:
-        if self.bus is None:
+        if self.opened is None:
             return
         for frame in frames:
             try:
-                os.write(self.bus.fd, frame)
+                os.write(self.opened.fd, frame)
             except OSError:  # down, full, or gone: the relay notices by itself
                 self._error_frames["error_frames_lost"] += 1
             else:
                 self._error_frames["error_frames"] += 1
 
     def _dropped(self) -> Counter[str]:
-        return self._dropped_before + Counter(self.bus.dropped() if self.bus else {})
+        return self._dropped_before + Counter(self.opened.dropped() if self.opened else {})
 
     def put_error_frame(self, frame: bytes) -> None:
-        """A CAN error frame that tells of the adapter's bus; sent soon, if there are many."""
-        if self._config.health.error_frames and self.bus is not None:
+        """A CAN error frame that tells of the adapter's CAN bus; sent soon, if there are many."""
+        if self._config.health.error_frames and self.opened is not None:
             self._put(self._limit.add(frame, time.monotonic()))
 
-    def hand_over(self) -> Bus | None:
-        """The open bus, for a successor's use(), with `reason`; None: there is none."""
-        if self.bus is None:
+    def hand_over(self) -> OpenInterface | None:
+        """The open interface, for a successor's use(), with `reason`; None: there is none."""
+        if self.opened is None:
             return None
         self._put(self._limit.take_all())
         self._relay.detach_interface()
-        bus, self.bus = self.bus, None
-        return bus
+        opened, self.opened = self.opened, None
+        return opened
 
     def close(self) -> None:
         """Idempotent."""
-        if self.bus is None:
+        if self.opened is None:
             return
         self._put(self._limit.take_all())
         self._relay.detach_interface()
         self._dropped_before = self._dropped()
-        self.bus.close()
-        self.bus = None
+        self.opened.close()
+        self.opened = None
 
     def _look(self) -> None:
         from bridged.interfaces.socketcan import is_up  # noqa: PLC0415 - no other interface is ever down

@@ -2,9 +2,9 @@
 
 Some devices know the end of a message by its length only. One that stops reading in the middle of a frame,
 and reads on after its port was opened anew, would fill that frame with the bytes of our first command, and
-put it on the bus. What the kernel and the FTDI chip hold is thrown away when a port is closed and opened, and
-nobody can tell how much that was: so the rest of the frame is not known then. An open port keeps it, and the
-device gets the frame whole, if late.
+put it on its CAN bus. What the kernel and the FTDI chip hold is thrown away when a port is closed and opened,
+and nobody can tell how much that was: so the rest of the frame is not known then. An open port keeps it, and
+the device gets the frame whole, if late.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Event(enum.Enum):
     REFUSED = enum.auto()  # wrong device, or a refused setting
     SILENT = enum.auto()  # the running adapter answers nothing any more, or must begin anew
     BUS_OFF = enum.auto()  # and must not be restarted
-    RESTART = enum.auto()  # the interface came up: whoever did that wants the bus back
+    RESTART = enum.auto()  # the interface came up: whoever did that wants it to carry frames
     PORT_LOST = enum.auto()
     CLOSED = enum.auto()  # the closing steps are done, whatever they met
     TIMER = enum.auto()

@@ -37,7 +37,7 @@ class HealthLog:
         self._warnings = LogLimiter(LOG_INTERVAL_S)
 
     def state(self, state: BusState, description: str) -> None:
-        """A bus that is never well for long is not told each time."""
+        """A CAN bus that is never well for long is not told each time."""
         if state is BusState.ERROR_ACTIVE:
             level = logging.DEBUG if self._states.quiet else logging.INFO
             log.log(level, "CAN bus: %s again", state.text)
@@ -269,5 +269,5 @@ class HealthPolling:
 
 
 def _taken(counted: _relay.Tally) -> int:
-    """Frames that the adapter took into its buffer, or put on its bus, by its word."""
+    """Frames that the adapter took into its buffer, or put on its CAN bus, by its word."""
     return counted.tx_frames + counted.tx_queued

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-STUCK_LEAST_S = 0.5  # a slow, busy bus is no reason
+STUCK_LEAST_S = 0.5  # a slow, busy CAN bus is no reason
 UNANSWERED_LOG_S = 10.0
 REFUSING_S, REFUSING_LONGEST_S = 60.0, 3600.0
 
@@ -36,8 +36,8 @@ def stuck_s(config: Config) -> float:
 class Recovery:
     """Decides for a running adapter; the owner acts on the verdict. None: nothing is to be done.
 
-    Frames that wait in the adapter's own buffer would be sent whenever the bus lets them, however old: so the
-    channel is closed in any case.
+    Frames that wait in the adapter's own buffer would be sent whenever its CAN bus lets them, however old: so
+    the channel is closed in any case.
     """
 
     def __init__(self, config: Config, adapter: Adapter) -> None:
@@ -62,10 +62,10 @@ class Recovery:
             return Verdict(Event.SILENT, f"{cause}{ANEW}", restart.seconds, off_bus=True)
         if restart is Restart.ITSELF:
             return None
-        bus = self._config.bus
+        interface = self._config.bus
         how = "a new start of the bridge"
-        if bus.interface == "socketcan":
-            how = f"ip link set {bus.channel} down, then up,"
+        if interface.interface == "socketcan":
+            how = f"ip link set {interface.channel} down, then up,"
         reason = f"{cause}; channel.restart is never: {how} puts it on the bus again"
         return Verdict(Event.BUS_OFF, reason, off_bus=True)
 

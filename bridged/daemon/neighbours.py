@@ -103,7 +103,7 @@ class Neighbours:
 
     def _ask(self, bridge: Bridge, strangers: dict[Path, int]) -> None:
         """Tells of those that are on the same interface."""
-        bus = bridge.config.bus
+        ours = bridge.config.bus
         for path, inode in strangers.items():
             try:
                 status = query(path)
@@ -112,14 +112,14 @@ class Neighbours:
             self._asked[path] = inode
             theirs = status.get("bus")
             if isinstance(theirs, dict) and (theirs.get("interface"), theirs.get("channel")) == (
-                bus.interface,
-                bus.channel,
+                ours.interface,
+                ours.channel,
             ):
                 self._beside[path] = name = str(status.get("name"))
                 log.warning(
                     "%s is also fed by bridge %r: each sends what the other's adapter receives, so these two "
                     "adapters must not be on the same CAN bus",
-                    bus.channel or bus.interface,
+                    ours.channel or ours.interface,
                     name,
                 )
 
@@ -131,9 +131,9 @@ class Neighbours:
         came: set[bytes] = set()
         went: list[bytes] = []
         for _ in range(GLIMPSES):
-            from_bus, to_bus = bridge.glimpse()
-            came.add(_content(from_bus))
-            went.append(_content(to_bus))
+            from_interface, to_interface = bridge.glimpse()
+            came.add(_content(from_interface))
+            went.append(_content(to_interface))
             time.sleep(GLIMPSE_INTERVAL_S)
         read = bridge.frames_read() - read
         fed = {name: n - others[name] for name, n in self._received_by_others().items() if name in others}

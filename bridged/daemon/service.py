@@ -82,8 +82,8 @@ class Service:
     the new configuration; without `successor` SIGHUP is a stop.
 
     The adapter of the old one is closed before the new one opens its own. The process, its counters, the
-    status socket and, unless its section has changed, the open bus stay: frames sent meanwhile wait there
-    until the new adapter runs, or fails to. What `mounted` finds changed is reloaded like that, too.
+    status socket and, unless its section has changed, the open interface stay: frames sent meanwhile wait
+    there until the new adapter runs, or fails to. What `mounted` finds changed is reloaded like that, too.
     """
 
     def __init__(
@@ -228,25 +228,25 @@ class Service:
     # --- systemd ------------------------------------------------------------------------------
 
     def _tell(self) -> None:
-        state, reason, bus_open = self.bridge.condition()
-        self._tell_status(state, reason, bus_open=bus_open)
-        self._tell_ready(time.monotonic(), reason, bus_open=bus_open)
+        state, reason, interface_open = self.bridge.condition()
+        self._tell_status(state, reason, interface_open=interface_open)
+        self._tell_ready(time.monotonic(), reason, interface_open=interface_open)
 
-    def _tell_status(self, state: State, reason: str, *, bus_open: bool) -> None:
-        told = (self.bridge, state, reason, bus_open, self._refusal)
+    def _tell_status(self, state: State, reason: str, *, interface_open: bool) -> None:
+        told = (self.bridge, state, reason, interface_open, self._refusal)
         if told == self._told:
             return
         self._told = told
-        self._status = _describe(self.bridge, state, reason, bus_open=bus_open) or self._status
+        self._status = _describe(self.bridge, state, reason, interface_open=interface_open) or self._status
         refusal = f" (reload refused: {self._refusal})" if self._refusal else ""
         self._notifier.status(self._status + refusal)
 
-    def _tell_ready(self, now: float, reason: str, *, bus_open: bool) -> None:
+    def _tell_ready(self, now: float, reason: str, *, interface_open: bool) -> None:
         """Once: the interface is open, or it is not to be had and a boot must not hang for it."""
-        if self._ready_at is None or not (bus_open or now >= self._ready_at):
+        if self._ready_at is None or not (interface_open or now >= self._ready_at):
             return
         self._ready_at = None
-        if not bus_open:
+        if not interface_open:
             log.error("ready without the CAN interface, which is tried again each second: %s", reason)
         self._notifier.ready()
         if self._notifier.feed_interval_s is not None:
@@ -264,12 +264,12 @@ class Service:
             log.error("the relay hangs: systemd's watchdog is not fed any more")
 
 
-def _describe(bridge: Bridge, state: State, reason: str, *, bus_open: bool) -> str:
+def _describe(bridge: Bridge, state: State, reason: str, *, interface_open: bool) -> str:
     """The line for `systemctl status`; empty between two tries, where the last one goes on."""
     adapter = bridge.config.adapter
     if state in {State.STOPPING, State.STOPPED}:
         return "stopping"
-    if not bus_open:
+    if not interface_open:
         return reason or "opening the CAN interface"
     if state is State.RUNNING:
         identity = bridge.adapter.identity

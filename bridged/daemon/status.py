@@ -2,7 +2,7 @@
 
 version (of can-bridge), name, state, reason, channel_open (None: the adapter was never asked; true also where
 it did not say), bus_state, tec, rec (None: not known), rates {rx_fps, tx_fps: frames a second},
-answer_time_ms {min, median, max: of the adapter's last answers to questions about its bus},
+answer_time_ms {min, median, max: of the adapter's last answers to questions about its CAN bus},
 adapter {type, port, version, serial_number}, bus {interface, channel, open, up: it is open and carries
 frames},
 counters {rx_frames: frames put on the interface; tx_frames: frames the adapter vouches for; tx_queued: frames

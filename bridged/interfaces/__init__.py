@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from bridged.interfaces.base import Bus
+    from bridged.interfaces.base import OpenInterface
 
 
-def open_bus(interface: str, channel: str, *, create: bool, options: Mapping[str, object]) -> Bus:
+def open_interface(
+    interface: str, channel: str, *, create: bool, options: Mapping[str, object]
+) -> OpenInterface:
     """Open `channel` of a python-can interface name; `socketcan` is the kernel's own and needs no python-can.
 
-    `create` is for socketcan alone, `options` for the others. Raises BusError, with what to do about it.
+    `create` is for socketcan alone, `options` for the others. InterfaceError says what to do.
     """
     if interface == "socketcan":
         from bridged.interfaces.socketcan import open_socketcan  # noqa: PLC0415 - only the kind that is used

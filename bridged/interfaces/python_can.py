@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import can
 
-from bridged.errors import BusError
+from bridged.errors import InterfaceError
 from bridged.interfaces.backends import missing_package
 from bridged.interfaces.base import LOST_ERROR_FRAMES
 from bridged.interfaces.socketcan import receive_stamped, set_buffers
@@ -45,32 +45,36 @@ _CARRY_ERROR_FRAMES: Final = frozenset({"udp_multicast", "virtual"})
 _ECHO: Final = frozenset({"udp_multicast"})
 
 # Reasons of dropped()
-_OVERFLOW: Final = "bus-pump-overflow"  # bus -> device: the relay did not keep up
-_RECV_FAILED: Final = "bus-recv-failed"  # bus -> device: the driver could not make a message of it
-_SEND_FAILED: Final = "bus-send-failed"  # device -> bus: the driver refused, or its queue stayed full
+_OVERFLOW: Final = "bus-pump-overflow"  # interface -> device: the relay did not keep up
+_RECV_FAILED: Final = "bus-recv-failed"  # interface -> device: the driver could not make a message of it
+_SEND_FAILED: Final = "bus-send-failed"  # device -> interface: the driver refused, or its queue stayed full
 
 _log = logging.getLogger(__name__)
 
 
-def open_python_can(interface: str, channel: str, options: Mapping[str, object]) -> PythonCanBus:
+def open_python_can(interface: str, channel: str, options: Mapping[str, object]) -> PythonCanInterface:
     """Open `channel` of the python-can `interface`; `options` go to it as they are, as in its documentation.
 
-    Like every program with python-can it also reads /etc/can.conf and ~/.canrc. Raises BusError.
+    Like every program with python-can it also reads /etc/can.conf and ~/.canrc. Raises InterfaceError.
     """
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
-        raise BusError(f"python-can {can.__version__} knows no interface {interface!r}; it knows {known}")
+        raise InterfaceError(
+            f"python-can {can.__version__} knows no interface {interface!r}; it knows {known}"
+        )
     if options.get("receive_own_messages"):
-        raise BusError(f"{interface}: receive_own_messages would send every frame back to where it came from")
+        raise InterfaceError(
+            f"{interface}: receive_own_messages would send every frame back to where it came from"
+        )
     if text := missing_package(interface):
-        raise BusError(text)
+        raise InterfaceError(text)
     arguments: dict[str, Any] = {**options, "receive_own_messages": False}
     try:
         bus = can.Bus(interface=interface, channel=channel or None, **arguments)
     except Exception as error:  # drivers raise far more than CanError
         _release_half_made(error)
-        raise BusError(f"{interface} {channel}: {error or type(error).__name__}") from error
-    return PythonCanBus(interface, channel, bus)
+        raise InterfaceError(f"{interface} {channel}: {error or type(error).__name__}") from error
+    return PythonCanInterface(interface, channel, bus)
 
 
 def _release_half_made(error: Exception) -> None:
@@ -84,10 +88,10 @@ def _release_half_made(error: Exception) -> None:
             return
 
 
-class PythonCanBus(Pump):
+class PythonCanInterface(Pump):
     """`struct can_frame` to a python-can bus, its messages back; CAN FD ones come as `struct canfd_frame`."""
 
-    error = BusError
+    error = InterfaceError
 
     def __init__(self, interface: str, channel: str, bus: can.BusABC) -> None:
         super().__init__(f"{interface} {channel}".strip(), socket.SOCK_SEQPACKET)

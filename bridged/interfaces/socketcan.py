@@ -10,7 +10,7 @@ import socket
 import struct
 from typing import Final
 
-from bridged.errors import GET_CAN, NO_CAN, BridgeError, BusError
+from bridged.errors import GET_CAN, NO_CAN, BridgeError, InterfaceError
 
 # Not in Python's socket module: asm-generic/socket.h, linux/sockios.h, net/if.h, net/if_arp.h, linux/can/*.h
 _SO_SNDBUFFORCE: Final = 32
@@ -26,7 +26,7 @@ _CAN_RAW_ERR_FILTER: Final = 2
 _CAN_ERR_MASK: Final = 0x1FFFFFFF
 
 _SK_MEMINFO_DROPS: Final = 8  # linux/sock_diag.h
-_OVERFLOW: Final = "socket-overflow"  # bus -> device: the relay did not come to read in time
+_OVERFLOW: Final = "socket-overflow"  # interface -> device: the relay did not come to read in time
 
 _IFREQ: Final = struct.Struct("=16sH22x")  # name, then flags or the family of the hardware address
 _NAME_MAX: Final = 15
@@ -46,8 +46,8 @@ _IFINFOMSG: Final = struct.Struct("=BxHiII")  # family, type, index, flags, mask
 _NLMSGERR: Final = struct.Struct("=i")  # 0 or -errno, behind the header of the answer
 
 
-class SocketcanBus:
-    """A non-blocking CAN_RAW socket that gets all frames of the bus but those it sent itself."""
+class SocketcanInterface:
+    """A non-blocking CAN_RAW socket that gets all frames of the interface but those it sent itself."""
 
     def __init__(self, channel: str, sock: socket.socket, warning: str) -> None:
         self.description = f"socketcan {channel}"
@@ -68,13 +68,14 @@ class SocketcanBus:
         self._socket.close()
 
 
-def open_socketcan(channel: str, create: bool) -> SocketcanBus:
+def open_socketcan(channel: str, create: bool) -> SocketcanInterface:
     """Open the interface `channel`; `create` makes it as a vcan if it is missing and brings it up.
 
-    An interface that is down opens (frames are lost until it is up, `warning` says so). Raises BusError.
+    An interface that is down opens (frames are lost until it is up, `warning` says so).
+    Raises InterfaceError.
     """
     if not 0 < len(channel.encode()) <= _NAME_MAX or "/" in channel or channel.split() != [channel]:
-        raise BusError(
+        raise InterfaceError(
             f"{channel!r} is no name of an interface: 1 to {_NAME_MAX} characters, no '/', no space"
         )
     sock = _raw_socket()
@@ -84,16 +85,16 @@ def open_socketcan(channel: str, create: bool) -> SocketcanBus:
         sock.bind((channel,))
     except OSError as error:
         sock.close()
-        raise BusError(f"{channel}: cannot be opened: {error.strerror}") from error
-    except BusError:
+        raise InterfaceError(f"{channel}: cannot be opened: {error.strerror}") from error
+    except InterfaceError:
         sock.close()
         raise
     warning = "" if flags & _IFF_UP else f"{channel} is down: ip link set {channel} up (or `create: true`)"
-    return SocketcanBus(channel, sock, warning)
+    return SocketcanInterface(channel, sock, warning)
 
 
 def make_interface(channel: str) -> bool:
-    """Make the vcan `channel` if there is none and bring it up; False: it was up before. Raises BusError."""
+    """Make the vcan `channel` if there is none and bring it up; False: it was up before. InterfaceError."""
     was_up = is_up(channel)
     open_socketcan(channel, create=True).close()
     return not was_up
@@ -113,10 +114,10 @@ def _raw_socket() -> socket.socket:
         return socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     except OSError as error:
         if error.errno not in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT}:
-            raise BusError(f"no CAN socket: {error.strerror}") from error
+            raise InterfaceError(f"no CAN socket: {error.strerror}") from error
         service = "allow AF_CAN in RestrictAddressFamilies=, " if "NOTIFY_SOCKET" in os.environ else ""
         other = "or use another python-can interface (`interface: udp_multicast`)"
-        raise BusError(f"{NO_CAN}: {GET_CAN}, {service}{other}") from error
+        raise InterfaceError(f"{NO_CAN}: {GET_CAN}, {service}{other}") from error
 
 
 def _prepare_interface(sock: socket.socket, channel: str, create: bool) -> int:
@@ -127,14 +128,14 @@ def _prepare_interface(sock: socket.socket, channel: str, create: bool) -> int:
         if error.errno != errno.ENODEV:
             raise
         if not create:
-            raise BusError(
+            raise InterfaceError(
                 f"{channel}: there is no such interface ({_present(sock)}); `ip link add dev {channel} "
                 f"type vcan` and `ip link set {channel} up` make a virtual one, and so does `create: true`"
             ) from error
         _create_vcan(channel)
         _, family = _ifreq(sock, _SIOCGIFHWADDR, channel)
     if family != _ARPHRD_CAN:
-        raise BusError(f"{channel}: not a CAN interface ({_present(sock)})")
+        raise InterfaceError(f"{channel}: not a CAN interface ({_present(sock)})")
     _, flags = _ifreq(sock, _SIOCGIFFLAGS, channel)
     if create and not flags & _IFF_UP:
         flags |= _IFF_UP
@@ -183,33 +184,33 @@ def _bring_up(sock: socket.socket, channel: str, flags: int) -> None:
     try:
         _ifreq(sock, _SIOCSIFFLAGS, channel, flags)
     except PermissionError as error:
-        raise BusError(
+        raise InterfaceError(
             f"{channel}: is down, and to bring it up takes CAP_NET_ADMIN: `ip link set {channel} up` as root"
         ) from error
     except OSError as error:
-        raise BusError(
+        raise InterfaceError(
             f"{channel}: is down and does not come up ({error.strerror}); a real CAN controller needs its "
             f"bit rate first: `ip link set {channel} up type can bitrate 125000`"
         ) from error
 
 
 def _create_vcan(channel: str) -> None:
-    """What `ip link add dev vcan0 type vcan` does; the kernel loads its module by itself. Raises BusError."""
+    """What `ip link add dev vcan0 type vcan` does; the kernel loads its module by itself."""
     code = _request_link(channel, b"vcan")
     if code in {0, errno.EEXIST}:  # somebody else was faster: as good
         return
     cause = OSError(code, os.strerror(code))
     if code in {errno.EPERM, errno.EACCES}:
-        raise BusError(
+        raise InterfaceError(
             f"{channel}: creating it needs CAP_NET_ADMIN: `can-bridge interface {channel}` as root, in a "
             "container as uid 0 with --cap-add NET_ADMIN; in the service AmbientCapabilities=CAP_NET_ADMIN"
         ) from cause
     if code == errno.EOPNOTSUPP:
-        raise BusError(
+        raise InterfaceError(
             f"{channel}: cannot be made, this kernel has no vcan: try `modprobe vcan` (Ubuntu: package "
             "linux-modules-extra-$(uname -r))"
         ) from cause
-    raise BusError(f"{channel}: cannot be made: {cause.strerror}") from cause
+    raise InterfaceError(f"{channel}: cannot be made: {cause.strerror}") from cause
 
 
 def _request_link(channel: str, kind: bytes) -> int:

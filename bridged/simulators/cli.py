@@ -80,7 +80,7 @@ def _add_common(parser: argparse.ArgumentParser, meanings: Mapping[str, str]) ->
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate until SIGTERM or SIGINT, then return 0; PortError, BusError if an end cannot be had."""
+    """Simulate until SIGTERM or SIGINT, then return 0; PortError, InterfaceError if an end cannot be had."""
     if args.count and not args.traffic:
         raise BridgeError("--count is a number of frames of --traffic, which is not there")
     device = simulator(args.simulator).make_device(time.monotonic(), args)

@@ -18,7 +18,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridged.errors import GET_CAN, NO_CAN, BusError, PortError
+from bridged.errors import GET_CAN, NO_CAN, InterfaceError, PortError
 from bridged.simulators.sja1000 import Frame
 
 if TYPE_CHECKING:
@@ -61,19 +61,19 @@ def unpack(raw: bytes) -> Frame | None:
 
 
 def open_can(interface: str) -> socket.socket:
-    """A raw socket on a SocketCAN interface; BusError if there is none."""
+    """A raw socket on a SocketCAN interface; InterfaceError if there is none."""
     try:
         bus = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
-        raise BusError(f"{NO_CAN}: {GET_CAN}") from error
+        raise InterfaceError(f"{NO_CAN}: {GET_CAN}") from error
     try:
         bus.bind((interface,))
     except OSError as error:
         bus.close()
         if error.errno == errno.ENODEV:
             make = f"`ip link add dev {interface} type vcan; ip link set {interface} up` makes one"
-            raise BusError(f"{interface}: there is no such interface: {make}") from error
-        raise BusError(f"{interface}: cannot be opened as a CAN interface: {error.strerror}") from error
+            raise InterfaceError(f"{interface}: there is no such interface: {make}") from error
+        raise InterfaceError(f"{interface}: cannot be opened as a CAN interface: {error.strerror}") from error
     try:
         bus.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
     except PermissionError:

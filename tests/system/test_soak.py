@@ -19,7 +19,7 @@ from rig import DEADLINE_S, Resources, Rig, no_huge_pages, wait_until
 from test_can232 import balanced
 from wired import WiredAdapter, assert_flat, in_order, numbered_frames, plugged, wait_terminal
 
-from bridged.errors import BusError
+from bridged.errors import InterfaceError
 from bridged.simulators import SIMULATORS, simulator
 from bridged.simulators.ends import CAN_FRAME, EXTENDED, open_can, unpack
 from bridged.simulators.faults import Fault, meanings
@@ -114,7 +114,7 @@ class Station(threading.Thread):
                 self._socket = self._socket or open_can(self._interface)
                 self._listen(self._socket)
                 self._send(self._socket)
-            except (BusError, OSError) as error:
+            except (InterfaceError, OSError) as error:
                 if self._socket and getattr(error, "errno", 0) != errno.ENETDOWN:  # that may come back
                     self._socket.close()
                     self._socket = None

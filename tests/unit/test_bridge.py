@@ -60,7 +60,7 @@ def test_an_interface_that_was_lost_with_the_port_is_opened_again(
     relay = SimpleNamespace(events=lambda: [(_relay.EVENT_INTERFACE_LOST, errno.ENODEV, b"")])
     monkeypatch.setattr(bridge._loop, "relay", relay)
     bridge._release()
-    assert bridge._interface.bus is None
+    assert bridge._interface.opened is None
     assert bridge._interface.reason.startswith("bus lost: pair")
     bridge.close()
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 from benches.bridge import PairBus
 
-from bridged.bridge import interface as bus_end
+from bridged.bridge import interface as interface_module
 from bridged.bridge.interface import RETRY_S, Interface
 from bridged.can import CAN_ERR_BUSERROR, CAN_ERR_CRTL, CAN_ERR_LOSTARB, error_frame
 from bridged.config import load
-from bridged.errors import BusError
+from bridged.errors import InterfaceError
 from bridged.interfaces import socketcan
 
 if TYPE_CHECKING:
@@ -65,10 +65,10 @@ class Bench:
         self.now, self.up = 1000.0, False
         self.relay = Relay()
         self.buses: list[LosingBus] = []
-        self.error: BusError | None = None
+        self.error: InterfaceError | None = None
         self.warning = ""
         self.end = Interface(load(file), cast("_relay.Relay", self.relay), self.open)
-        monkeypatch.setattr(bus_end, "time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(interface_module, "time", SimpleNamespace(monotonic=lambda: self.now))
         monkeypatch.setattr(socketcan, "is_up", lambda _channel: self.up)
 
     def open(self, *_args: object, **_options: object) -> LosingBus:
@@ -118,11 +118,11 @@ def test_lost_and_opened_again(bench: Bench, caplog: pytest.LogCaptureFixture) -
     end = bench.end
     end.open()
     assert (bench.relay.bus, end.next_at) == (bench.buses[0].fd, None)
-    bench.error = BusError("vcan0: there is no such interface")
+    bench.error = InterfaceError("vcan0: there is no such interface")
     end.on_lost(errno.ENODEV)
     end.on_lost(errno.ENODEV)  # late news
     bench.pass_time(100.0)
-    assert (end.bus, end.reason, bench.relay.bus) == (
+    assert (end.opened, end.reason, bench.relay.bus) == (
         None,
         "bus not open: vcan0: there is no such interface",
         -1,
@@ -134,7 +134,7 @@ def test_lost_and_opened_again(bench: Bench, caplog: pytest.LogCaptureFixture) -
     ]
     bench.error = None
     bench.pass_time(RETRY_S)
-    assert (end.bus, end.reason, end.next_at) == (bench.buses[1], "", None)
+    assert (end.opened, end.reason, end.next_at) == (bench.buses[1], "", None)
     assert end.lost_frames() == {"socket-overflow": 6}
     assert lines(caplog) == ["bus open: pair"]
 
@@ -147,12 +147,12 @@ def test_out_of_descriptors(bench: Bench, caplog: pytest.LogCaptureFixture, hand
         end.use(bench.open())
     else:
         end.open()
-    assert (end.bus, end.reason) == (None, "bus not open: pair: Too many open files")
+    assert (end.opened, end.reason) == (None, "bus not open: pair: Too many open files")
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(bench.buses[0].fd)
     bench.relay.error = 0
     bench.pass_time(RETRY_S)
-    assert (end.bus, end.reason, end.next_at) == (bench.buses[1], "", None)
+    assert (end.opened, end.reason, end.next_at) == (bench.buses[1], "", None)
     assert lines(caplog) == ["bus not open: pair: Too many open files", "bus open: pair"]
 
 
@@ -184,7 +184,7 @@ def test_deleted_while_down(bench: Bench) -> None:
     bench.end.on_down()
     bench.end.on_lost(errno.ENODEV)
     bench.pass_time(0.0)
-    assert (bench.end.bus, bench.end.reason) == (bench.buses[1], "")
+    assert (bench.end.opened, bench.end.reason) == (bench.buses[1], "")
 
 
 def test_what_comes_and_goes_all_the_time_fills_no_log(
@@ -256,7 +256,7 @@ def test_error_frames_go_on_on_an_interface_that_was_lost_while_one_waited(bench
 def test_handed_over(bench: Bench) -> None:
     bench.end.open()
     bus: Any = bench.end.hand_over()
-    assert (bus, bench.end.bus, bench.relay.bus) == (bench.buses[0], None, -1)
+    assert (bus, bench.end.opened, bench.relay.bus) == (bench.buses[0], None, -1)
     assert bench.end.hand_over() is None
     bench.end.use(bus)
     assert bench.relay.bus == bus.fd

@@ -16,7 +16,7 @@ from benches.status_socket import serving, snapshot
 
 from bridged import VERSION, cli, interfaces
 from bridged.daemon import directories, privileges, status_text
-from bridged.errors import BusError
+from bridged.errors import InterfaceError
 from bridged.interfaces import socketcan
 from bridged.settings import BusConfig
 
@@ -215,14 +215,14 @@ class TestUser:
     ) -> tuple[Callable[..., Any], list[str]]:
         done: list[str] = []
 
-        def open_bus(*_arguments: Any, **options: Any) -> Any:
+        def open_interface(*_arguments: Any, **options: Any) -> Any:
             done.append(f"create={options['create']}")
             one = found.pop(0)
-            if isinstance(one, BusError):
+            if isinstance(one, InterfaceError):
                 raise one
             return one
 
-        monkeypatch.setattr(interfaces, "open_bus", open_bus)
+        monkeypatch.setattr(interfaces, "open_interface", open_interface)
         monkeypatch.setattr(privileges, "become", lambda user: done.append(f"become {user}"))
         return cli._opened_as("65532", self.BUS), done
 
@@ -236,9 +236,9 @@ class TestUser:
         assert done[2:] == ["create=False"]
 
     def test_an_error_is_told_by_the_bridge(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        open_interface, done = self.opened(monkeypatch, [BusError("vcan0: no"), "second"])
+        open_interface, done = self.opened(monkeypatch, [InterfaceError("vcan0: no"), "second"])
         assert done == ["create=True", "become 65532"]
-        with pytest.raises(BusError, match="vcan0: no"):
+        with pytest.raises(InterfaceError, match="vcan0: no"):
             open_interface("socketcan", "vcan0", create=True, options={})
         assert open_interface("socketcan", "vcan0", create=True, options={}) == "second"
 

@@ -8,7 +8,7 @@ import can
 import pytest
 
 from bridged import demo
-from bridged.errors import NO_CAN, BusError
+from bridged.errors import NO_CAN, InterfaceError
 
 
 @pytest.mark.parametrize("adapter", ["can232", "usb2can"])
@@ -18,7 +18,7 @@ def test_frames_go_both_ways_and_all_is_closed(
     """On a kernel without CAN, so that no interface of this machine has anything to do with it."""
 
     def no_can(*_args: object, **_options: object) -> NoReturn:
-        raise BusError(NO_CAN)
+        raise InterfaceError(NO_CAN)
 
     monkeypatch.setattr(demo, "open_socketcan", no_can)
     parser = argparse.ArgumentParser()

@@ -119,6 +119,7 @@ LARGE = {
     "adapters.usb2can.Usb2can": 14,  # the same
     "simulators.can232.Can232": 15,  # the registers of a device
     "simulators.usb2can_firmware.Firmware": 19,  # the same
+    "simulators.slcan.Slcan": 21,  # the same
     "simulators.uart.Uart": 16,  # what is on the line in each direction, and counters for the benches
     "simulators.serve.Simulator": 37,  # to be split: the device's ends, the agenda of its faults, its traffic
 }

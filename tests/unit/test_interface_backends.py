@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from bridged.config import check
-from bridged.errors import BusError, ConfigError
-from bridged.interfaces import backends, open_bus
+from bridged.errors import ConfigError, InterfaceError
+from bridged.interfaces import backends, open_interface
 
 GOOD = "adapter: {type: can232, port: /dev/ttyUSB0}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\n"
 
@@ -64,5 +64,5 @@ def test_a_package_that_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     text = rf"udp_multicast needs the package msgpack: {sys.executable} -m pip install 'msgpack'"
     with pytest.raises(ConfigError, match=text):
         warnings_of(tmp_path, GOOD.replace("vcan0", "239.74.163.2, interface: udp_multicast"))
-    with pytest.raises(BusError, match=text):
-        open_bus("udp_multicast", "239.74.163.2", create=False, options={})
+    with pytest.raises(InterfaceError, match=text):
+        open_interface("udp_multicast", "239.74.163.2", create=False, options={})

@@ -19,15 +19,15 @@ import can
 import pytest
 from can.interfaces import udp_multicast, virtual
 
-from bridged.errors import BusError
-from bridged.interfaces import open_bus, python_can
+from bridged.errors import InterfaceError
+from bridged.interfaces import open_interface, python_can
 from bridged.interfaces.base import LOST_ERROR_FRAMES
-from bridged.interfaces.python_can import PythonCanBus, pack_message, unpack_frame
+from bridged.interfaces.python_can import PythonCanInterface, pack_message, unpack_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bridged.interfaces.base import Bus
+    from bridged.interfaces.base import OpenInterface
 
 LIMIT_S = 30.0  # for what takes milliseconds
 EFF, RTR, ERR = 0x80000000, 0x40000000, 0x20000000
@@ -105,30 +105,30 @@ def assert_arrives(peer: can.BusABC, fields: dict[str, object]) -> None:
     assert message.equals(can.Message(**fields), timestamp_delta=None)  # type: ignore[arg-type]
 
 
-def receive(bus: Bus) -> bytes:
+def receive(bus: OpenInterface) -> bytes:
     assert select.select([bus.fd], [], [], LIMIT_S)[0], "nothing came"
     return os.read(bus.fd, 128)
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[PythonCanBus, can.BusABC]]:
+def pair() -> Iterator[tuple[PythonCanInterface, can.BusABC]]:
     channel = f"test {uuid.uuid4()}"
-    bus = open_bus("virtual", channel, create=False, options={})
-    assert isinstance(bus, PythonCanBus)
+    bus = open_interface("virtual", channel, create=False, options={})
+    assert isinstance(bus, PythonCanInterface)
     with can.Bus(interface="virtual", channel=channel) as peer:
         yield bus, peer
         bus.close()
 
 
 class TestVirtual:
-    def test_every_kind_of_frame_to_the_bus(self, pair: tuple[PythonCanBus, can.BusABC]) -> None:
+    def test_every_kind_of_frame_to_the_bus(self, pair: tuple[PythonCanInterface, can.BusABC]) -> None:
         bus, peer = pair
         for packet, _ in CLASSIC:
             os.write(bus.fd, packet)
         for _, fields in CLASSIC:
             assert_arrives(peer, fields)
 
-    def test_every_kind_of_frame_from_the_bus(self, pair: tuple[PythonCanBus, can.BusABC]) -> None:
+    def test_every_kind_of_frame_from_the_bus(self, pair: tuple[PythonCanInterface, can.BusABC]) -> None:
         bus, peer = pair
         for _, fields in CLASSIC:
             peer.send(can.Message(**fields))  # type: ignore[arg-type]
@@ -138,7 +138,7 @@ class TestVirtual:
         assert receive(bus) == canfd_frame(5, 0x04, bytes(12))
         assert bus.dropped() == {}
 
-    def test_nothing_comes_back(self, pair: tuple[PythonCanBus, can.BusABC]) -> None:
+    def test_nothing_comes_back(self, pair: tuple[PythonCanInterface, can.BusABC]) -> None:
         bus, peer = pair
         os.write(bus.fd, frame(0x123, b"own"))
         assert peer.recv(LIMIT_S) is not None
@@ -147,7 +147,7 @@ class TestVirtual:
         with pytest.raises(BlockingIOError):
             os.read(bus.fd, 128)
 
-    def test_each_frame_has_a_time_stamp(self, pair: tuple[PythonCanBus, can.BusABC]) -> None:
+    def test_each_frame_has_a_time_stamp(self, pair: tuple[PythonCanInterface, can.BusABC]) -> None:
         bus, peer = pair
         peer.send(can.Message(arbitration_id=1))
         assert select.select([bus.fd], [], [], LIMIT_S)[0]
@@ -157,7 +157,7 @@ class TestVirtual:
         seconds, nanoseconds = struct.unpack("@ll", stamp)
         assert abs(time.time() - (seconds + nanoseconds * 1e-9)) < LIMIT_S
 
-    def test_burst_keeps_its_order(self, pair: tuple[PythonCanBus, can.BusABC]) -> None:
+    def test_burst_keeps_its_order(self, pair: tuple[PythonCanInterface, can.BusABC]) -> None:
         bus, peer = pair
         poll = select.poll()
         poll.register(bus.fd, select.POLLOUT)
@@ -173,7 +173,7 @@ class TestVirtual:
         channel = f"test {uuid.uuid4()}"
         threads = threading.active_count()
         before = open_files()
-        bus = open_bus("virtual", channel, create=False, options={})
+        bus = open_interface("virtual", channel, create=False, options={})
         assert channel in virtual.channels
         start = time.monotonic()
         bus.close()
@@ -202,7 +202,7 @@ def multicast() -> dict[str, object]:
 class TestUdpMulticast:
     def test_both_ways_and_nothing_comes_back(self, multicast: dict[str, object]) -> None:
         """It gives a sender its own frames, unmarked: the one interface that needs care of its own."""
-        bus = open_bus("udp_multicast", "239.74.163.2", create=False, options=multicast)
+        bus = open_interface("udp_multicast", "239.74.163.2", create=False, options=multicast)
         with can.Bus(interface="udp_multicast", channel="239.74.163.2", **multicast) as peer:  # type: ignore[arg-type]
             for packet, fields in CLASSIC:
                 os.write(bus.fd, packet)
@@ -249,7 +249,7 @@ def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(python_can, "_RECV_PAUSE_S", 0)
 
 
-def wait_until_sent(bus: PythonCanBus) -> None:
+def wait_until_sent(bus: PythonCanInterface) -> None:
     """The outward thread has taken everything that was written: its end of the pair ends, then it."""
     bus._near.shutdown(socket.SHUT_WR)
     bus._threads[1].join(LIMIT_S)
@@ -261,7 +261,7 @@ class TestFaults:
     def test_bad_message_is_data(self) -> None:
         good = can.Message(arbitration_id=7, is_extended_id=False)
         bad: list[can.Message | Exception] = [ValueError("bad bytes"), can.CanOperationError("noise")]
-        bus = PythonCanBus("slcan", "x", FaultyBus(incoming=[*bad * 4, good, *bad * 4, good]))
+        bus = PythonCanInterface("slcan", "x", FaultyBus(incoming=[*bad * 4, good, *bad * 4, good]))
         assert receive(bus) == frame(7)
         assert receive(bus) == frame(7)
         assert bus.dropped() == {"bus-recv-failed": 16}
@@ -271,10 +271,10 @@ class TestFaults:
     def test_ten_in_a_row_end_the_descriptor_and_say_why(self) -> None:
         good = can.Message(arbitration_id=7, is_extended_id=False)
         gone = OSError(errno.ENODEV, "No such device")
-        bus = PythonCanBus("gs_usb", "0", FaultyBus(incoming=[good, *[gone] * 10]))
+        bus = PythonCanInterface("gs_usb", "0", FaultyBus(incoming=[good, *[gone] * 10]))
         assert receive(bus) == frame(7)
         assert receive(bus) == b""
-        assert isinstance(bus.failure, BusError)
+        assert isinstance(bus.failure, InterfaceError)
         assert str(bus.failure) == "gs_usb 0: [Errno 19] No such device"
         assert bus.failure.__cause__ is gone
         with pytest.raises(BrokenPipeError):
@@ -284,7 +284,7 @@ class TestFaults:
     def test_what_does_not_fit_is_counted(self, caplog: pytest.LogCaptureFixture) -> None:
         sent = 20_000
         driver = FaultyBus(incoming=[can.Message(arbitration_id=number) for number in range(sent)])
-        bus = PythonCanBus("virtual", "x", driver)
+        bus = PythonCanInterface("virtual", "x", driver)
         assert driver.drained.wait(LIMIT_S)  # nobody reads the while
         received = []
         with contextlib.suppress(BlockingIOError):
@@ -298,7 +298,7 @@ class TestFaults:
         bus.close()
 
     def test_refused_frames_are_counted(self, caplog: pytest.LogCaptureFixture) -> None:
-        bus = PythonCanBus("pcan", "x", FaultyBus(send_error=can.CanOperationError("queue full")))
+        bus = PythonCanInterface("pcan", "x", FaultyBus(send_error=can.CanOperationError("queue full")))
         for _ in range(25):
             os.write(bus.fd, frame(1))
         wait_until_sent(bus)
@@ -311,7 +311,7 @@ class TestFaults:
 
     def test_error_frames_go_to_software_buses_only(self) -> None:
         driver = FaultyBus()
-        bus = PythonCanBus("slcan", "x", driver)
+        bus = PythonCanInterface("slcan", "x", driver)
         os.write(bus.fd, frame(ERR | 0x40, bytes(8)))
         os.write(bus.fd, frame(0x40))
         wait_until_sent(bus)
@@ -322,19 +322,19 @@ class TestFaults:
     def test_echoes_of_the_driver_are_left_out(self) -> None:
         echo = can.Message(arbitration_id=1, is_extended_id=False, is_rx=False)
         other = can.Message(arbitration_id=2, is_extended_id=False)
-        bus = PythonCanBus("gs_usb", "0", FaultyBus(incoming=[echo, other]))
+        bus = PythonCanInterface("gs_usb", "0", FaultyBus(incoming=[echo, other]))
         assert receive(bus) == frame(2)
         bus.close()
 
 
 class TestOpenErrors:
     def test_unknown_interface(self) -> None:
-        with pytest.raises(BusError, match=r"knows no interface 'telepathy'; it knows .*pcan.*virtual"):
-            open_bus("telepathy", "x", create=False, options={})
+        with pytest.raises(InterfaceError, match=r"knows no interface 'telepathy'; it knows .*pcan.*virtual"):
+            open_interface("telepathy", "x", create=False, options={})
 
     def test_own_messages(self) -> None:
-        with pytest.raises(BusError, match="receive_own_messages would send every frame back"):
-            open_bus("virtual", "x", create=False, options={"receive_own_messages": True})
+        with pytest.raises(InterfaceError, match="receive_own_messages would send every frame back"):
+            open_interface("virtual", "x", create=False, options={"receive_own_messages": True})
 
     def test_a_driver_that_fails_half_way_leaves_nothing_behind(
         self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -346,20 +346,20 @@ class TestOpenErrors:
 
         monkeypatch.setattr(udp_multicast.bus, "GeneralPurposeUdpMulticastBus", refuse)
         for _ in range(3):
-            with pytest.raises(BusError, match="already in use"):
-                open_bus("udp_multicast", "239.74.163.2", create=False, options={})
+            with pytest.raises(InterfaceError, match="already in use"):
+                open_interface("udp_multicast", "239.74.163.2", create=False, options={})
         gc.collect()
         assert caplog.messages == []
 
     def test_driver_that_does_not_open(self) -> None:
-        with pytest.raises(BusError, match=r"^serial /dev/nothing: ") as caught:
-            open_bus("serial", "/dev/nothing", create=False, options={})
+        with pytest.raises(InterfaceError, match=r"^serial /dev/nothing: ") as caught:
+            open_interface("serial", "/dev/nothing", create=False, options={})
         assert caught.value.__cause__ is not None
 
     def test_options_go_to_the_interface(self) -> None:
-        bus = open_bus(
+        bus = open_interface(
             "virtual", str(uuid.uuid4()), create=False, options={"rx_queue_size": 3, "bitrate": 125000}
         )
-        assert isinstance(bus, PythonCanBus)
+        assert isinstance(bus, PythonCanInterface)
         assert bus._bus.queue.maxsize == 3  # type: ignore[attr-defined]
         bus.close()

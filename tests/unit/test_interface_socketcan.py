@@ -1,4 +1,4 @@
-"""A socketcan interface without CAN in the kernel; with it: tests/system/test_buses_socketcan.py."""
+"""A socketcan interface without CAN in the kernel; with it: tests/system/test_interface_socketcan.py."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridged.errors import BusError
-from bridged.interfaces import open_bus, socketcan
+from bridged.errors import InterfaceError
+from bridged.interfaces import open_interface, socketcan
 
 if TYPE_CHECKING:
     pass
@@ -26,14 +26,14 @@ def has_can() -> bool:
 class TestSocketcan:
     @pytest.mark.skipif(has_can(), reason="this kernel has CAN")
     def test_kernel_without_can(self) -> None:
-        with pytest.raises(BusError, match=r"no SocketCAN: try `modprobe can_raw`") as caught:
-            open_bus("socketcan", "vcan0", create=True, options={})
+        with pytest.raises(InterfaceError, match=r"no SocketCAN: try `modprobe can_raw`") as caught:
+            open_interface("socketcan", "vcan0", create=True, options={})
         assert isinstance(caught.value.__cause__, OSError)
 
     @pytest.mark.parametrize("name", ["", "a/b", "0123456789abcdef", "vcan 0", "vcan0\n"])
     def test_names_that_no_interface_can_have(self, name: str) -> None:
-        with pytest.raises(BusError, match="is no name of an interface"):
-            open_bus("socketcan", name, create=True, options={})
+        with pytest.raises(InterfaceError, match="is no name of an interface"):
+            open_interface("socketcan", name, create=True, options={})
 
     @pytest.mark.parametrize(
         ("code", "advice"),
@@ -50,7 +50,7 @@ class TestSocketcan:
         self, code: int, advice: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(socketcan, "_request_link", lambda *_: code)
-        with pytest.raises(BusError, match=f"^vcan0: .*{advice}") as caught:
+        with pytest.raises(InterfaceError, match=f"^vcan0: .*{advice}") as caught:
             socketcan._create_vcan("vcan0")
         assert isinstance(caught.value.__cause__, OSError)
 

@@ -18,7 +18,7 @@ from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Event, State, Verdict
 from bridged.bridge.recovery import Recovery
 from bridged.can import CAN_ERR_BUSOFF, CAN_ERR_CRTL, CAN_ERR_RESTARTED, CRTL_ACTIVE, BusState, error_frame
-from bridged.interfaces.python_can import PythonCanBus
+from bridged.interfaces.python_can import PythonCanInterface
 from bridged.settings import After, Restart
 from bridged.simulators.can232 import Can232
 
@@ -78,7 +78,7 @@ def heals(bench: Bench, bridge: Bridge, device: Can232, born: list[float]) -> No
 
 def test_an_interface_without_error_frames_makes_no_counter_negative(can232: Bench) -> None:
     """The bridge's own error frames are no frames of the adapter's, wherever they end."""
-    bus = PythonCanBus("pcan", "x", can.Bus(interface="virtual", channel=str(can232.folder)))
+    bus = PythonCanInterface("pcan", "x", can.Bus(interface="virtual", channel=str(can232.folder)))
     can232.open_interface = lambda *_args, **_options: bus
     device = Can232(time.monotonic())
     can232.plug_in(device)

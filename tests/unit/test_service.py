@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from bridged import VERSION
-from bridged.bridge import interface as bus_end
+from bridged.bridge import interface as interface_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
 from bridged.config import load
@@ -26,9 +26,9 @@ from bridged.daemon import service
 from bridged.daemon.eeprom_store import FileMemory
 from bridged.daemon.notify import Notifier
 from bridged.daemon.service import Service
-from bridged.errors import BusError
-from bridged.interfaces import open_bus
-from bridged.interfaces.base import Bus
+from bridged.errors import InterfaceError
+from bridged.interfaces import open_interface
+from bridged.interfaces.base import OpenInterface
 from bridged.interfaces.python_can import open_python_can
 from bridged.settings import Config, Restart
 
@@ -294,23 +294,23 @@ class TestSignals:
 
 class TestReload:
     @pytest.fixture
-    def opened(self) -> list[Bus]:
+    def opened(self) -> list[OpenInterface]:
         """The interfaces that bridges have opened."""
         return []
 
     @pytest.fixture
-    def running(self, tmp_path: Path, opened: list[Bus]) -> tuple[Service, Path, list[str]]:
+    def running(self, tmp_path: Path, opened: list[OpenInterface]) -> tuple[Service, Path, list[str]]:
         """A service in this process; the test's own thread is the one that runs it."""
         file = write_config(tmp_path / "one.yaml", bus=tmp_path.name)
         memory = FileMemory(tmp_path)
         heard: list[str] = []
 
-        def open_interface(*arguments: Any, **options: Any) -> Bus:
-            opened.append(open_bus(*arguments, **options))
+        def noted(*arguments: Any, **options: Any) -> OpenInterface:
+            opened.append(open_interface(*arguments, **options))
             return opened[-1]
 
         def bridge(config: Config) -> Bridge:
-            return Bridge(config, memory, open_interface=open_interface)
+            return Bridge(config, memory, open_interface=noted)
 
         def successor(present: Any) -> Bridge | None:
             fresh = load(file)
@@ -334,7 +334,7 @@ class TestReload:
         thread.join()
 
     def test_the_bus_stays_open_if_its_section_has_not_changed(
-        self, running: tuple[Service, Path, list[str]], opened: list[Bus]
+        self, running: tuple[Service, Path, list[str]], opened: list[OpenInterface]
     ) -> None:
         made, file, heard = running
         first = made.bridge
@@ -415,17 +415,17 @@ class TestReady:
         return made
 
     def test_when_the_interface_is_open(self, waiting: Service, heard: list[str]) -> None:
-        waiting._tell_ready(100.1, "", bus_open=False)
+        waiting._tell_ready(100.1, "", interface_open=False)
         assert heard == []
-        waiting._tell_ready(100.2, "", bus_open=True)
-        waiting._tell_ready(200.0, "vcan0 was deleted", bus_open=False)
+        waiting._tell_ready(100.2, "", interface_open=True)
+        waiting._tell_ready(200.0, "vcan0 was deleted", interface_open=False)
         assert heard == ["READY=1"]
 
     def test_after_five_seconds_without_it(
         self, waiting: Service, heard: list[str], caplog: pytest.LogCaptureFixture
     ) -> None:
         for now in (104.9, 105.0, 106.0):
-            waiting._tell_ready(now, "bus not open: vcan0: there is no such interface", bus_open=False)
+            waiting._tell_ready(now, "bus not open: vcan0: there is no such interface", interface_open=False)
             assert heard == ["READY=1"] * (now >= 105.0)
         (record,) = caplog.records
         assert record.levelno == logging.ERROR
@@ -435,13 +435,13 @@ class TestReady:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(service, "READY_LIMIT_S", 0.01)
-        monkeypatch.setattr(bus_end, "RETRY_S", 0.05)
+        monkeypatch.setattr(interface_module, "RETRY_S", 0.05)
         opened: list[object] = []
 
-        def open_interface(*arguments: Any, **_options: Any) -> Bus:
+        def open_interface(*arguments: Any, **_options: Any) -> OpenInterface:
             opened.append(arguments)
             if len(opened) < 3:
-                raise BusError("vcan0: there is no such interface")
+                raise InterfaceError("vcan0: there is no such interface")
             return open_python_can("virtual", tmp_path.name, {})
 
         heard: list[str] = []
@@ -481,7 +481,7 @@ class TestWatchdog:
 
 
 @pytest.mark.parametrize(
-    ("state", "reason", "bus_open", "line"),
+    ("state", "reason", "interface_open", "line"),
     [
         (State.RUNNING, "", True, RUNNING),
         (State.RUNNING, "vcan0 is down", True, f"{RUNNING}, but vcan0 is down"),
@@ -494,7 +494,7 @@ class TestWatchdog:
         (State.STOPPING, "", True, "stopping"),
     ],
 )
-def test_status_line(state: State, reason: str, bus_open: bool, line: str) -> None:
+def test_status_line(state: State, reason: str, interface_open: bool, line: str) -> None:
     bridge: Any = SimpleNamespace(
         config=SimpleNamespace(
             adapter=SimpleNamespace(type="usb2can", port="/dev/ttyUSB0"), bus=SimpleNamespace(channel="vcan0")
@@ -503,7 +503,7 @@ def test_status_line(state: State, reason: str, bus_open: bool, line: str) -> No
             identity=SimpleNamespace(version="HW0003FW0016", serial_number="RIG0001"),
         ),
     )
-    assert service._describe(bridge, state, reason, bus_open=bus_open) == line
+    assert service._describe(bridge, state, reason, interface_open=interface_open) == line
 
 
 def test_sighup_of_a_terminal_stops_and_of_a_service_reloads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from benches.simulating import (
     until,
 )
 
-from bridged.errors import BusError, PortError
+from bridged.errors import InterfaceError, PortError
 from bridged.simulators.can232 import Can232
 from bridged.simulators.ends import LineEnd, open_can
 from bridged.simulators.serve import Simulator
@@ -49,7 +49,7 @@ def test_a_bus_that_cannot_be_had(monkeypatch: pytest.MonkeyPatch, at: str, code
             raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(socket, "socket", Refusing)
-    with pytest.raises(BusError, match=text):
+    with pytest.raises(InterfaceError, match=text):
         open_can("vcan7")
 
 

@@ -26,7 +26,7 @@ from benches.simulating import (
     until,
 )
 
-from bridged.errors import BusError, PortError
+from bridged.errors import InterfaceError, PortError
 from bridged.simulators.can232 import Can232
 from bridged.simulators.can232_memory import Eeprom, load_eeprom
 from bridged.simulators.ends import HOST_BUFFER, BusEnd, HeldUp, PtyEnd, open_can, pack, unpack
@@ -266,7 +266,7 @@ def test_a_bus_that_does_not_take_frames_loses_them_counted(bus: tuple[socket.so
 
 
 def test_a_missing_can_interface_is_an_error():
-    with pytest.raises(BusError, match="CAN"):
+    with pytest.raises(InterfaceError, match="CAN"):
         open_can("nocan99")
 
 

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridged.errors import BusError
-from bridged.interfaces import open_bus
+from bridged.errors import InterfaceError
+from bridged.interfaces import open_interface
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bridged.interfaces.base import Bus
+    from bridged.interfaces.base import OpenInterface
 
 LIMIT_S = 5.0
 NAME = "bridgetest0"
@@ -64,8 +64,8 @@ def vcan(absent: str) -> str:
     return absent
 
 
-def open_socketcan(channel: str, *, create: bool = False) -> Bus:
-    return open_bus("socketcan", channel, create=create, options={})
+def open_socketcan(channel: str, *, create: bool = False) -> OpenInterface:
+    return open_interface("socketcan", channel, create=create, options={})
 
 
 def other(channel: str) -> socket.socket:
@@ -81,7 +81,7 @@ def frame(can_id: int, data: bytes = b"") -> bytes:
     return struct.pack("=IB3x8s", can_id, len(data), data)
 
 
-def receive(bus: Bus) -> bytes:
+def receive(bus: OpenInterface) -> bytes:
     assert select.select([bus.fd], [], [], LIMIT_S)[0], "nothing came"
     return os.read(bus.fd, 128)
 
@@ -159,10 +159,10 @@ class TestFrames:
 class TestInterface:
     def test_missing(self, absent: str) -> None:
         text = f"{absent}: there is no such interface .* `ip link add dev {absent} type vcan`"
-        with pytest.raises(BusError, match=text):
+        with pytest.raises(InterfaceError, match=text):
             open_socketcan(absent)
         ip("link", "add", "dev", absent, "type", "vcan")
-        with pytest.raises(BusError, match=rf"vcan99: .*CAN interfaces here: .*{absent}"):
+        with pytest.raises(InterfaceError, match=rf"vcan99: .*CAN interfaces here: .*{absent}"):
             open_socketcan("vcan99")
 
     def test_create(self, absent: str) -> None:
@@ -211,13 +211,13 @@ class TestInterface:
 
     @pytest.mark.parametrize("create", [False, True])
     def test_not_can(self, create: bool) -> None:
-        with pytest.raises(BusError, match=r"^lo: not a CAN interface \(CAN interfaces here: "):
+        with pytest.raises(InterfaceError, match=r"^lo: not a CAN interface \(CAN interfaces here: "):
             open_socketcan("lo", create=create)
 
     def test_leaks_no_socket(self, absent: str) -> None:
         before = sorted(os.listdir("/proc/self/fd"))  # noqa: PTH208 - names, not paths
         for name in (absent, "lo"):
-            with pytest.raises(BusError):
+            with pytest.raises(InterfaceError):
                 open_socketcan(name)
         assert sorted(os.listdir("/proc/self/fd")) == before  # noqa: PTH208
 
@@ -237,11 +237,11 @@ class TestWithoutPrivileges:
 
     @pytest.mark.usefixtures("nobody")
     def test_create(self) -> None:
-        with pytest.raises(BusError, match="creating it needs CAP_NET_ADMIN: `can-bridge interface"):
+        with pytest.raises(InterfaceError, match="creating it needs CAP_NET_ADMIN: `can-bridge interface"):
             open_socketcan("bridgetest1", create=True)
 
     def test_bring_up(self, down: str, nobody: None) -> None:  # noqa: ARG002 - in this order
-        with pytest.raises(BusError, match=f"CAP_NET_ADMIN: `ip link set {down} up` as root"):
+        with pytest.raises(InterfaceError, match=f"CAP_NET_ADMIN: `ip link set {down} up` as root"):
             open_socketcan(down, create=True)
 
     def test_open(self, vcan: str, nobody: None) -> None:  # noqa: ARG002 - in this order
