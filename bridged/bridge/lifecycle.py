@@ -13,6 +13,8 @@ from bridged.bridge.backoff import Backoff, chance
 from bridged.bridge.log_limiter import LogLimiter, repeated
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from bridged.settings import ReconnectConfig
 
 log = logging.getLogger(__name__)
@@ -173,15 +175,15 @@ class Lifecycle:
     """The state of one bridge's adapter, why it is in it, and when the next try is due.
 
     The owner performs the actions that take() returns, in order, each together with schedule(), and calls
-    take() with TIMER when `next_at` has come. Times are seconds of any clock.
+    take() with TIMER when `next_at` has come. Times are seconds of any clock; `random` gives 0 to 1.
     """
 
-    def __init__(self, reconnect: ReconnectConfig) -> None:
+    def __init__(self, reconnect: ReconnectConfig, random: Callable[[], float] = chance) -> None:
         self.state = State.IDLE
         self.reason = ""  # why the state is not running
         self.next_at: float | None = None
         self.is_restart = False  # the adapter left its CAN bus because of bus-off when it ran last
-        self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, chance)
+        self._backoff = Backoff(reconnect.initial_s, reconnect.maximum_s, random)
         self._pause_s: float | None = None  # before the next try, if the back-off does not decide
         self._log_limiter = LogLimiter()
 

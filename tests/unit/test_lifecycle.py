@@ -8,8 +8,19 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bridged.bridge.backoff import JITTER, Backoff
-from bridged.bridge.lifecycle import IGNORED, TABLE, Action, Event, State, transition
+from bridged.bridge.backoff import JITTER, STABLE_S
+from bridged.bridge.lifecycle import (
+    IGNORED,
+    STOP_S,
+    TABLE,
+    Action,
+    Event,
+    Lifecycle,
+    State,
+    Verdict,
+    transition,
+)
+from bridged.settings import ReconnectConfig
 
 # Events that a state can meet, and no others: RELEASE drops what the relay still had to say, a timer is set
 # in four states only, and nobody looks out for the device before the start.
@@ -64,8 +75,9 @@ def test_stop_leads_to_the_end(state: State) -> None:
 
 # --- the whole, in simulated time -------------------------------------------------------------
 
-OPEN_S, STEP_S, SILENCE_S, STOP_S = 0.01, 0.05, 0.5, 1.5
+OPEN_S, STEP_S, SILENCE_S = 0.01, 0.05, 0.5
 INITIAL_S, MAXIMUM_S = 0.1, 5.0
+TIMED = {Action.LOOK, Action.WAIT, Action.WAIT_LONG, Action.LIMIT}
 
 
 class World(RuleBasedStateMachine):
@@ -74,13 +86,12 @@ class World(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0.0
-        self.state = State.IDLE
-        self.backoff = Backoff(INITIAL_S, MAXIMUM_S, lambda: self.jitter)
         self.jitter = 0.0
+        reconnect = ReconnectConfig(initial_s=INITIAL_S, maximum_s=MAXIMUM_S)
+        self.life = Lifecycle(reconnect, lambda: self.jitter)
         # The world.
         self.present, self.openable, self.answers, self.right = True, True, True, True
-        # The bridge: what is set to happen and when; only one of each.
-        self.timer: float | None = None
+        # The bridge: what is set to happen and when, beside the timer of its life; only one of each.
         self.result: tuple[float, Event] | None = None  # of opening, initialising, closing
         self.opening = self.port_open = self.gates_open = self.finished = self.looking_out = False
         self.tries: list[float] = []
@@ -89,10 +100,20 @@ class World(RuleBasedStateMachine):
 
     # The bridge
 
+    @property
+    def state(self) -> State:
+        return self.life.state
+
     def dispatch(self, event: Event) -> None:
-        assert event in POSSIBLE[self.state], (self.state, event)
-        self.state, actions = transition(self.state, event)
+        before = self.state
+        assert event in POSSIBLE[before], (before, event)
+        actions = self.life.take(Verdict(event))
+        if self.state is not before:
+            self.life.log_change("", self.now)
         for action in actions:
+            if action in TIMED:
+                assert self.life.next_at is None, "two timers"
+            self.life.schedule(action, self.now)
             getattr(self, f"do_{action.name.lower()}")()
 
     def do_look(self) -> None:
@@ -104,7 +125,8 @@ class World(RuleBasedStateMachine):
     def do_open(self) -> None:
         assert not self.port_open
         assert not self.opening
-        self.timer, self.looking_out, self.opening = None, False, True
+        assert self.life.next_at is None
+        self.looking_out, self.opening = False, True
         # By itself it does not hammer; news of the device may have it try at once.
         assert self.pushed or not self.tries or self.now - self.tries[-1] >= (1 - JITTER) * INITIAL_S
         self.pushed = False
@@ -117,7 +139,6 @@ class World(RuleBasedStateMachine):
 
     def do_run(self) -> None:
         self.gates_open = True
-        self.backoff.runs(self.now)
 
     def do_close(self) -> None:
         assert self.port_open
@@ -126,8 +147,7 @@ class World(RuleBasedStateMachine):
         self.result = self.now + (10 * STOP_S if slow else STEP_S), Event.CLOSED
 
     def do_limit(self) -> None:
-        assert self.timer is None, "two timers"
-        self.timer = self.now + STOP_S
+        assert self.life.next_at == self.now + STOP_S
 
     def do_last_words(self) -> None:
         assert self.port_open
@@ -137,22 +157,19 @@ class World(RuleBasedStateMachine):
         self.result = None
 
     def do_wait(self) -> None:
-        self.set_timer(self.backoff.next_s(self.now))
+        assert self.life.next_at is not None
+        assert (1 - JITTER) * INITIAL_S - 1e-6 <= self.life.next_at - self.now <= MAXIMUM_S + 1e-6
+        self.looking_out = True
 
     def do_wait_long(self) -> None:
-        self.set_timer(self.backoff.longest_s())
+        self.do_wait()
 
     def do_shorten_pauses(self) -> None:
-        self.backoff.reset()
+        pass
 
     def do_finish(self) -> None:
         assert not self.port_open
-        self.finished, self.looking_out, self.timer = True, False, None
-
-    def set_timer(self, seconds: float) -> None:
-        assert self.timer is None, "two timers"
-        assert (1 - JITTER) * INITIAL_S <= seconds <= MAXIMUM_S
-        self.timer, self.looking_out = self.now + seconds, True
+        self.finished, self.looking_out = True, False
 
     # What happens to it
 
@@ -177,15 +194,16 @@ class World(RuleBasedStateMachine):
 
     def step(self, end: float) -> None:
         """To the next thing that is due, or to the end."""
-        due = [at for at in (self.timer, self.result and self.result[0]) if at is not None and at <= end]
+        due = [
+            at for at in (self.life.next_at, self.result and self.result[0]) if at is not None and at <= end
+        ]
         if not due:
             if self.state is State.RUNNING and not self.answers and end - self.now >= SILENCE_S:
                 self.dispatch(Event.SILENT)
             self.now = end
             return
         self.now = max(self.now, min(due))
-        if self.timer is not None and self.timer <= self.now:
-            self.timer = None
+        if self.life.has_timed_out(self.now):
             self.dispatch(Event.TIMER)
         elif self.result is not None:
             if self.opening:
@@ -263,7 +281,7 @@ class World(RuleBasedStateMachine):
     def one_thing_at_a_time(self) -> None:
         pausing = self.state in {State.WAITING, State.BACKOFF, State.FAULT}
         assert pausing == self.looking_out
-        assert (self.timer is not None) == (pausing or self.state is State.STOPPING)
+        assert (self.life.next_at is not None) == (pausing or self.state is State.STOPPING)
         assert self.gates_open == (self.state is State.RUNNING)
         assert self.opening == (self.state is State.OPENING) or self.finished
         closed = {State.IDLE, State.OPENING, State.WAITING, State.BACKOFF, State.FAULT, State.BUS_OFF}
@@ -310,3 +328,56 @@ def test_a_device_whose_permissions_come_late_is_tried_quickly() -> None:
     world.openable = True
     world.pass_time(1.0)
     assert world.state is State.RUNNING
+
+
+def running() -> Lifecycle:
+    """Since 100 s; the pauses are INITIAL_S at first, without jitter."""
+    life = Lifecycle(ReconnectConfig(initial_s=INITIAL_S, maximum_s=MAXIMUM_S), lambda: 0.0)
+    for event in (Event.START, Event.OPENED, Event.READY):
+        for action in life.take(Verdict(event)):
+            life.schedule(action, 100.0)
+    return life
+
+
+@pytest.mark.parametrize(("pause_s", "waits_s"), [(None, INITIAL_S), (2.5, 2.5)])
+def test_what_ended_a_run_may_say_how_long_the_pause_is(pause_s: float | None, waits_s: float) -> None:
+    life = running()
+    life.take(Verdict(Event.SILENT, "bus-off", pause_s, off_bus=True))
+    assert life.is_restart
+    life.take(Verdict(Event.CLOSED))
+    life.schedule(Action.WAIT, 200.0)
+    assert life.next_at == 200.0 + waits_s
+    assert not life.has_timed_out(200.0)
+    assert life.has_timed_out(200.0 + waits_s)
+    assert life.next_at is None
+
+
+def test_only_a_run_that_ended_in_bus_off_is_followed_by_a_restart() -> None:
+    life = running()
+    life.take(Verdict(Event.SILENT, "bus-off", off_bus=True))
+    for event in (Event.CLOSED, Event.TIMER, Event.OPENED, Event.READY):
+        life.take(Verdict(event))
+    assert life.is_restart  # of this run: the interface is told
+    life.take(Verdict(Event.PORT_LOST, "unplugged"))
+    assert not life.is_restart
+
+
+def test_other_pauses_shorten_the_one_that_is_under_way() -> None:
+    life = running()
+    life.take(Verdict(Event.PORT_LOST, "unplugged", 60.0))
+    life.schedule(Action.WAIT, 200.0)
+    life.reconfigure(ReconnectConfig(initial_s=1.0, maximum_s=9.0), 210.0)
+    assert life.next_at == 211.0
+    life.reconfigure(ReconnectConfig(initial_s=3.0, maximum_s=9.0), 210.0)
+    assert life.next_at == 211.0
+
+
+@pytest.mark.parametrize(("ran_s", "waits_s"), [(STABLE_S, INITIAL_S), (STABLE_S - 1, 4 * INITIAL_S)])
+def test_a_long_run_makes_the_pause_after_it_short(ran_s: float, waits_s: float) -> None:
+    life = running()
+    for _ in range(2):
+        life.schedule(Action.WAIT, 100.0)
+    life.schedule(Action.RUN, 100.0)
+    life.take(Verdict(Event.PORT_LOST, "unplugged"))
+    life.schedule(Action.WAIT, 100.0 + ran_s)
+    assert life.next_at == 100.0 + ran_s + waits_s
