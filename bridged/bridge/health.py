@@ -43,7 +43,7 @@ class Finding(NamedTuple):
 
 
 class Health:
-    """The state of the CAN bus, from all observations; None: not known."""
+    """The state of the adapter's CAN bus, from all observations. A value of None is not known."""
 
     def __init__(self) -> None:
         self.state: BusState | None = None
@@ -62,7 +62,7 @@ class Health:
         self.state = self.tec = self.rec = None
 
     def observe(self, seen: Observation, now_s: float) -> list[bytes]:
-        """Take it in; the error frames (struct can_frame) that tell the interface what is new."""
+        """Takes it in. Returns the error frames (struct can_frame) that tell the interface what is new."""
         frames: list[bytes] = []
         self.description = seen.description
         self._heard_s = now_s
@@ -81,7 +81,7 @@ class Health:
         return self._heard_s - self._full_s <= seconds
 
     def taken_off(self) -> list[bytes]:
-        """The bridge takes the adapter off its CAN bus, whatever that says; the error frames for it."""
+        """The bridge takes the adapter off its CAN bus. Returns the error frames that tell the interface."""
         if self._reported is BusState.BUS_OFF:
             return []
         self._reported = BusState.BUS_OFF

@@ -22,14 +22,14 @@ STUCK_LEAST_S = 0.5  # a slow, busy CAN bus is no reason
 UNANSWERED_LOG_S = 10.0
 REFUSING_S, REFUSING_LONGEST_S = 60.0, 3600.0
 
-ANEW = (
+REOPENED = (
     "; the channel is closed and opened anew, which throws away what is in the adapter's buffer, "
     "so that nothing is sent late"
 )
 
 
 def stuck_s(config: Config) -> float:
-    """For how long no frame may leave the adapter: what is in its buffer is older than the deadline then."""
+    """If no frame leaves the adapter for so long, those in its buffer are older than the deadline."""
     return max(config.transmit.deadline_s, STUCK_LEAST_S)
 
 
@@ -43,11 +43,11 @@ class Recovery:
     def __init__(self, config: Config, adapter: Adapter) -> None:
         self._config = config
         self._adapter = adapter
-        # An adapter that refuses every frame though its buffer is not full: a new start may help, but it may
-        # also be that it does not know such frames.
+        # For an adapter that refuses every frame though its buffer is not full. Initialising it again may
+        # help, or not: perhaps it does not know such frames. So that is done more and more rarely.
         self._refusing = Backoff(REFUSING_S, REFUSING_LONGEST_S, chance)
         self._refusing_until = 0.0
-        self._discarded = 0  # of the adapter's, those told
+        self._discarded = 0  # frames, those that the log has
         self._log_limiter = LogLimiter()
         self._unanswered_limiter = LogLimiter(UNANSWERED_LOG_S)
 
@@ -59,7 +59,7 @@ class Recovery:
         """The adapter is bus-off, or cannot tell whether it is."""
         restart = self._config.channel.restart
         if isinstance(restart, After):
-            return Verdict(Event.SILENT, f"{cause}{ANEW}", restart.seconds, off_bus=True)
+            return Verdict(Event.SILENT, f"{cause}{REOPENED}", restart.seconds, off_bus=True)
         if restart is Restart.ITSELF:
             return None
         interface = self._config.bus
@@ -80,7 +80,7 @@ class Recovery:
         cause = f"no frame has left the adapter for {limit_s:g} s"
         if self._adapter.flow is not None:
             why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
-            reason = f"{cause}, {frames} are in its buffer ({why}){ANEW}"
+            reason = f"{cause}, {frames} are in its buffer ({why}){REOPENED}"
             return Verdict(Event.SILENT, reason, pause_s)
         if polling.was_full(limit_s):  # it cannot tell bus-off
             return self.bus_off(
@@ -96,14 +96,14 @@ class Recovery:
         return Verdict(Event.SILENT, reason, pause_s)
 
     def unanswered(self, resyncs: int, now: float) -> None:
-        """Tells that an answer is missing, and how often that was so; the relay finds the thread again."""
+        """An answer is missing, for the n-th time: logs that the relay resynchronises the line."""
         times = self._unanswered_limiter.should_log("unanswered", now)
         self._unanswered_limiter.recovered()
         if times:
             log.warning("no answer from the adapter: resynchronising (resyncs=%d)", resyncs)
 
     def closed(self) -> None:
-        """Tells of frames that were in the adapter's buffer."""
+        """The adapter's channel is closed: logs how many frames were thrown away with its buffer."""
         frames, self._discarded = self._adapter.discarded - self._discarded, self._adapter.discarded
         times = self._log_limiter.should_log("discarded", time.monotonic()) if frames else 0
         if times:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Handler = Callable[[], None]
-# The bridge that is to take the place of one with this configuration; None: nothing has changed. ConfigError.
+# Builds the bridge that replaces the one of this configuration. None: nothing has changed. ConfigError.
 Successor = Callable[["Config"], "Bridge | None"]
 
 READY_LIMIT_S = 5.0  # a boot does not wait longer for the CAN interface
