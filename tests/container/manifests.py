@@ -263,7 +263,7 @@ def kubernetes_usb() -> str:
 def podman() -> str:
     name = "can"
     spec = {
-        "restartPolicy": "Always",
+        "restartPolicy": "OnFailure",
         "initContainers": [interface_container()],
         "containers": [bridge_container(), application_container()],
         "volumes": [configuration_volume(name)],
@@ -272,7 +272,10 @@ def podman() -> str:
         "An adapter behind a serial server, for `podman play kube podman.yaml`. Podman knows no sidecars:\n"
         "the interface is made first, then bridge and application start.",
         pod(name, SERIAL_SERVER, spec),
-        {"name: interface": KUBERNETES_COMMENTS["name: interface"]},
+        {
+            "name: interface": KUBERNETES_COMMENTS["name: interface"],
+            "restartPolicy:": "By Always podman 4.3 would start the first container again and again.",
+        },
     )
 
 
