@@ -108,10 +108,24 @@ class Relay:
         """All three anew; frames for which there is no room any more are dropped, the newest first."""
     def set_polling(self, request: bytes, prefix: bytes, interval: float, /) -> None:
         """Ask the device for frames with `request` until the port is detached."""
-    def set_sending(self, confirms: str, remote: str, /, *, window: int) -> None:
+    def set_sending(
+        self,
+        confirms: str,
+        remote: str,
+        /,
+        *,
+        window: int,
+        bitrate: int,
+        depth: int,
+        retries: bool,
+        long_stamps: bool,
+    ) -> None:
         """How the device wants its frames until the port is detached: adapters/base.py, `Sending`.
 
         `confirms`, `remote`: the values of Confirms and Remote. `window`: 0 for what the relay was made with.
+        `bitrate`: 0 for frames that go as the answers come; else they go no faster than a bus of this rate
+        takes them, at most `depth` at once in the device. `retries`: a refused frame is sent again.
+        `long_stamps`: received frames may have time stamps of 8 digits.
         """
     def set_level_window(
         self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int

@@ -90,6 +90,7 @@ class Remote(enum.Enum):
     PLAIN = "plain"
     WITH_DIGITS = "with-digits"  # with as many zeros behind it as a data frame of its DLC has digits
     NO_STANDARD = "no-standard"  # plain; one with a standard identifier cannot be sent
+    NONE = "none"  # none can be sent
 
 
 class Sending(NamedTuple):

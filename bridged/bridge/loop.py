@@ -9,8 +9,21 @@ from bridged import _relay
 from bridged.bridge.recovery import stuck_s
 
 if TYPE_CHECKING:
-    from bridged.adapters.base import Adapter
+    from bridged.adapters.base import Adapter, Sending
     from bridged.settings import Config
+
+
+def set_sending(relay: _relay.Relay, sending: Sending) -> None:
+    """How the adapter wants its frames; until its port is detached."""
+    relay.set_sending(
+        sending.confirms.value,
+        sending.remote.value,
+        window=sending.window or 0,
+        bitrate=sending.paced_bitrate or 0,
+        depth=sending.depth,
+        retries=sending.retries,
+        long_stamps=sending.long_stamps,
+    )
 
 
 class RelayLoop:
@@ -60,8 +73,7 @@ class RelayLoop:
         if adapter.polling is not None:
             polling = adapter.polling
             self.relay.set_polling(polling.request, polling.prefix, polling.interval_s)
-        sending = adapter.sending
-        self.relay.set_sending(sending.confirms.value, sending.remote.value, window=sending.window or 0)
+        set_sending(self.relay, adapter.sending)
         if adapter.flow is not None:
             flow = adapter.flow
             self.relay.set_level_window(

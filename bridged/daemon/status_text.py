@@ -53,7 +53,7 @@ def _lines(status: dict[str, Any]) -> list[str]:
         ),
         "rx dropped": _reasons(counters["rx_dropped"]) or "none",
         "sent": (
-            f"{counters['tx_frames']} frames to the adapter, {rates['tx_fps']:.0f}/s, "
+            f"{_given(counters)} to the adapter, {rates['tx_fps']:.0f}/s, "
             f"{counters['tx_retries']} retries, {status['queued']} queued"
         ),
         "tx dropped": _reasons(counters["tx_dropped"]) or "none",
@@ -69,7 +69,7 @@ def _short(status: dict[str, Any]) -> list[str]:
     dropped = sum(counters["rx_dropped"].values()) + sum(counters["tx_dropped"].values())
     reason = f" ({status['reason']})" if status["reason"] else ""
     return [
-        f"{_headline(status)}, {counters['rx_frames']} frames received, {counters['tx_frames']} sent, "
+        f"{_headline(status)}, {counters['rx_frames']} frames received, {_given(counters, '')} sent, "
         f"{dropped} dropped{reason}"
     ]
 
@@ -85,8 +85,16 @@ def _farewell(status: dict[str, Any]) -> list[str]:
     }
     return [
         f"stopped after {_duration(status['uptime_s'])}: {counters['rx_frames']} frames received, "
-        f"{counters['tx_frames']} sent; {dropped or 'none dropped'}; {channel[status['channel_open']]}"
+        f"{_given(counters, '')} sent; {dropped or 'none dropped'}; {channel[status['channel_open']]}"
     ]
+
+
+def _given(counters: dict[str, Any], frames: str = " frames") -> str:
+    """How many: `8 frames`; `8 frames, 3 queued, 2 unconfirmed` where the adapter does not vouch for all."""
+    others = [
+        f"{counters[f'tx_{name}']} {name}" for name in ("queued", "unconfirmed") if counters[f"tx_{name}"]
+    ]
+    return ", ".join([f"{counters['tx_frames']}{frames}", *others])
 
 
 def _reasons(dropped: dict[str, int]) -> str:

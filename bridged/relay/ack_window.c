@@ -23,18 +23,20 @@ void ack_window_init(struct ack_window *w, struct queue *queue, struct line *lin
     ack_window_reset(w);
 }
 
-/* What "done" means; until the port is detached. */
-void ack_window_set(struct ack_window *w, enum answer answer)
+/* What an answer means; until the port is detached. */
+void ack_window_set(struct ack_window *w, const struct sending_settings *set)
 {
     struct counters *c = w->queue->counters;
     uint64_t *const counter[ANSWERS] = {ANSWER_LIST(COUNTER_OF_ANSWER)};
-    w->taken = counter[answer];
+    w->taken = counter[set->answer];
+    w->retries = set->retries;
 }
 
 /* The port is gone or new. */
 void ack_window_reset(struct ack_window *w)
 {
-    ack_window_set(w, ANSWER_TAKEN);
+    const struct sending_settings usual = {.answer = ANSWER_TAKEN, .retries = true};
+    ack_window_set(w, &usual);
     w->checking = false;
     w->retry_delay_ns = RETRY_FIRST_NS;
     w->retry_at_ns = 0;
@@ -107,11 +109,24 @@ static void look_if_stuck(struct ack_window *w, int64_t now)
     events_emit(w->line->events, EVENT_STUCK, 0, NULL, 0);
 }
 
+static void refused_for_good(struct ack_window *w, int64_t now)
+{
+    const struct counters *count = w->line->counters;
+    if (count->tx_dropped[TX_REFUSED] % RETRIES_TOLD == 0)
+        events_emit(w->line->events, EVENT_FRAME_REFUSED, (uint32_t)count->retries, NULL, 0);
+    queue_drop(w->queue, TX_REFUSED);
+    look_if_stuck(w, now);
+}
+
 void ack_window_refused(struct ack_window *w, const struct inflight *frame, int64_t now)
 {
     const struct counters *count = w->line->counters;
     if (w->line->resyncing || line_noise(w->line) != frame->noise) {
         queue_drop(w->queue, TX_UNANSWERED);
+        return;
+    }
+    if (!w->retries) {
+        refused_for_good(w, now);
         return;
     }
     if (!queue_retry(w->queue, &frame->tx))

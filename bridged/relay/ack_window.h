@@ -8,6 +8,7 @@
 struct ack_window {
     struct queue *queue;
     struct line *line;
+    bool retries;    /* a refused frame was not taken; else it may have been on the bus, and is not sent again */
     uint64_t *taken; /* the counter of frames that the device answers with "done" */
     int64_t retry_at_ns, retry_delay_ns;
     int64_t refused_ns;   /* when the device began to refuse every frame; NEVER: it took the last one */
@@ -16,7 +17,7 @@ struct ack_window {
 };
 
 void ack_window_init(struct ack_window *w, struct queue *queue, struct line *line);
-void ack_window_set(struct ack_window *w, enum answer answer);
+void ack_window_set(struct ack_window *w, const struct sending_settings *set);
 void ack_window_reset(struct ack_window *w);
 void ack_window_confirmed(struct ack_window *w, uint64_t number);
 void ack_window_refused(struct ack_window *w, const struct inflight *frame, int64_t now);

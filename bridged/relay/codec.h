@@ -29,6 +29,16 @@ struct codec_message {
     size_t length;         /* CODEC_TEXT: length in bytes. CODEC_SKIPPED: how many bytes are skipped */
 };
 
+/* How a device wants a remote frame, where its protocol leaves a choice. */
+#define REMOTE_LIST(X) \
+    X(REMOTE_PLAIN, "plain") \
+    X(REMOTE_WITH_DIGITS, "with-digits") /* with as many zeros behind it as a data frame of its DLC has digits */ \
+    X(REMOTE_NO_STANDARD, "no-standard") /* plain; one with a standard identifier cannot be sent */ \
+    X(REMOTE_NONE, "none") /* none can be sent */
+
+#define REMOTE_NAME(name, ...) name,
+enum remote { REMOTE_LIST(REMOTE_NAME) REMOTES };
+
 /* No codec exceeds these, so buffers have their sizes; each codec asserts its own. */
 enum {
     CODEC_LINE_MAX = 256, /* line_max */
@@ -41,6 +51,7 @@ enum { CODEC_KEPT_MAX = 20 }; /* bytes of the longest message of a binary protoc
 struct codec_state {
     bool doubt; /* not certain where messages begin: a frame counts once something valid follows it */
     bool quiet; /* set by the caller: nothing has come for quiet_ns, decide with what there is */
+    bool short_stamps; /* set by the caller: a time stamp has 4 digits, so that 8 are a sign of a broken line */
     union {
         struct {
             bool discarding; /* inside a line that is too long: skip until its end */
@@ -90,7 +101,7 @@ struct codec {
     int64_t quiet_ns, doubt_quiet_ns;
     size_t (*decode)(struct codec_state *state, const uint8_t *in, size_t n, struct can_frame *frame,
                      struct codec_message *msg);
-    size_t (*encode)(const struct can_frame *frame, uint8_t *out);
+    size_t (*encode[REMOTES])(const struct can_frame *frame, uint8_t *out);
     int (*level)(const uint8_t *text, size_t length);
     size_t (*length)(const uint8_t *message, size_t n);
 };

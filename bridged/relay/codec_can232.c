@@ -3,7 +3,7 @@
  *
  * Received      message
  * t10021133\r   CODEC_FRAME: t standard, T extended, r and R the same as remote frames, which carry no data;
- *               4 hex digits of time stamp may follow (8 on some clones): "t100211334D67\r";
+ *               4 hex digits of time stamp may follow (8 where short_stamps is not set): "t100211334D67\r";
  *               a remote frame may have them after as much data as its DLC says, of no meaning: slcanpty
  * \r            CODEC_OK, but CODEC_SKIPPED when noise came just before it: it may be that line's end
  * z\r  Z\r      CODEC_SENT
@@ -92,7 +92,8 @@ static int stamp_measure(const uint8_t *in, size_t n)
 }
 
 /* A valid frame that is all there: its length with the CR. 0: it is none, or not all there yet. */
-static size_t frame_decode(const uint8_t *in, size_t n, struct can_frame *frame, struct codec_message *msg)
+static size_t frame_decode(const struct codec_state *state, const uint8_t *in, size_t n, struct can_frame *frame,
+                           struct codec_message *msg)
 {
     if (!is_frame_letter(in[0]))
         return 0;
@@ -119,11 +120,13 @@ static size_t frame_decode(const uint8_t *in, size_t n, struct can_frame *frame,
     if (n < body)
         return 0;
     int stamp_digits = stamp_measure(in + body, n - body);
-    if (stamp_digits < 0 && remote && n - body > 2 * (size_t)len && is_hex(in + body, 2 * (size_t)len)) {
+    unsigned int longest = state->short_stamps ? STAMP_STEP : STAMP_MAX;
+    if ((unsigned int)stamp_digits > longest && remote && n - body > 2 * (size_t)len
+        && is_hex(in + body, 2 * (size_t)len)) {
         body += 2 * (size_t)len;
         stamp_digits = stamp_measure(in + body, n - body);
     }
-    if (stamp_digits < 0)
+    if ((unsigned int)stamp_digits > longest) /* also where it is -1 */
         return 0;
 
     struct can_frame found;
@@ -215,7 +218,7 @@ static size_t can232_decode(struct codec_state *state, const uint8_t *in, size_t
         if (skipped > 0)
             return skipped;
     }
-    size_t taken = frame_decode(in, n, frame, msg);
+    size_t taken = frame_decode(state, in, n, frame, msg);
     if (taken > 0) {
         state->can232.dirty = false;
         return taken;
@@ -233,11 +236,16 @@ static size_t can232_decode(struct codec_state *state, const uint8_t *in, size_t
     }
 }
 
+static bool is_remote(const struct can_frame *frame)
+{
+    return frame->can_id & CAN_RTR_FLAG;
+}
+
 static size_t can232_encode(const struct can_frame *frame, uint8_t *out)
 {
     static const uint8_t digits[] = "0123456789ABCDEF";
     bool extended = frame->can_id & CAN_EFF_FLAG;
-    bool remote = frame->can_id & CAN_RTR_FLAG;
+    bool remote = is_remote(frame);
     canid_t id = frame->can_id & CAN_EFF_MASK;
     size_t len = frame->len;
     if ((frame->can_id & CAN_ERR_FLAG) || len > CAN_MAX_DLEN || (!extended && id > CAN_SFF_MASK))
@@ -259,6 +267,29 @@ static size_t can232_encode(const struct can_frame *frame, uint8_t *out)
     return n;
 }
 
+/* "r1002\r" becomes "r10020000\r". */
+static size_t can232_encode_digits(const struct can_frame *frame, uint8_t *out)
+{
+    size_t n = can232_encode(frame, out);
+    if (!n || !is_remote(frame))
+        return n;
+    memset(out + n - 1, '0', 2 * (size_t)frame->len);
+    n += 2 * (size_t)frame->len;
+    out[n - 1] = CR;
+    return n;
+}
+
+static size_t can232_encode_no_standard(const struct can_frame *frame, uint8_t *out)
+{
+    bool standard = !(frame->can_id & CAN_EFF_FLAG);
+    return standard && is_remote(frame) ? 0 : can232_encode(frame, out);
+}
+
+static size_t can232_encode_data(const struct can_frame *frame, uint8_t *out)
+{
+    return is_remote(frame) ? 0 : can232_encode(frame, out);
+}
+
 /* A command without CR (there are those that only spoil what was typed before) ends with all that there is. */
 static size_t can232_length(const uint8_t *message, size_t n)
 {
@@ -272,6 +303,11 @@ const struct codec codec_can232 = {
     .frame_max = CAN232_FRAME_MAX,
     .confirms = CONFIRMS_EACH,
     .decode = can232_decode,
-    .encode = can232_encode,
+    .encode = {
+        [REMOTE_PLAIN] = can232_encode,
+        [REMOTE_WITH_DIGITS] = can232_encode_digits,
+        [REMOTE_NO_STANDARD] = can232_encode_no_standard,
+        [REMOTE_NONE] = can232_encode_data,
+    },
     .length = can232_length,
 };

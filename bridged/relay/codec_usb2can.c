@@ -404,7 +404,7 @@ const struct codec codec_usb2can = {
     .quiet_ns = 1000000000,
     .doubt_quiet_ns = 50000000,
     .decode = usb2can_decode,
-    .encode = usb2can_encode,
+    .encode = {usb2can_encode, usb2can_encode, usb2can_encode, usb2can_encode}, /* there is one way */
     .level = usb2can_level,
     .length = usb2can_length,
 };

@@ -14,6 +14,7 @@
     X(TX_ERROR_FRAME, "error-frame", "error frames are the bus's own affair") \
     X(TX_FD_FRAME, "fd-frame", "the adapter knows classic CAN only") \
     X(TX_MALFORMED, "malformed", "no struct can_frame, or one the protocol cannot say") \
+    X(TX_REMOTE, "remote-frame", "a remote frame of a kind that this firmware cannot send") \
     X(TX_QUEUE_FULL, "queue-full", "the transmit queue was full") \
     X(TX_STALE, "stale", "older than the deadline before its turn came") \
     X(TX_REFUSED, "refused", "the adapter refused it, or handed it back, until its deadline") \
@@ -37,12 +38,6 @@
     X(ANSWER_QUEUED, "queued", buffered) /* it is in a buffer */ \
     X(ANSWER_ALWAYS, "always", unconfirmed) /* nothing: the device answers also where the frame is lost */ \
     X(ANSWER_NONE, "nothing", unconfirmed) /* the device answers no frame */
-
-/* How a remote frame is said. */
-#define REMOTE_LIST(X) \
-    X(REMOTE_PLAIN, "plain") \
-    X(REMOTE_WITH_DIGITS, "with-digits") /* with as many zeros behind it as a data frame of its DLC has digits */ \
-    X(REMOTE_NO_STANDARD, "no-standard") /* plain; one with a standard identifier cannot be sent */
 
 /* The kinds of event that events() returns. The name in Python is that of the enumerator. */
 #define EVENT_LIST(X) \
@@ -88,7 +83,6 @@ enum tx_drop { TX_DROP_LIST(LIST_NAME) TX_DROPS };
 enum rx_drop { RX_DROP_LIST(LIST_NAME) RX_DROPS };
 enum event_kind { EVENT_LIST(LIST_NAME) EVENT_KINDS };
 enum answer { ANSWER_LIST(LIST_NAME) ANSWERS };
-enum remote { REMOTE_LIST(LIST_NAME) REMOTES };
 
 struct counters {
     COUNTER_LIST(LIST_FIELD)

@@ -11,6 +11,22 @@ enum { SYNC_TRIES = 3 }; /* unanswered sync commands until the device counts as 
 static_assert((int)CODEC_FRAME_MAX <= (int)COMMAND_SIZE, "the room for a command is room for a frame");
 static_assert((int)WINDOW_MAX < (int)INFLIGHT_MAX, "room for the sync command behind a full window");
 
+/* How the device wants its frames; until the port is detached. */
+void line_set(struct line *l, const struct sending_settings *set)
+{
+    bool each = l->codec->confirms == CONFIRMS_EACH;
+    l->encode = l->codec->encode[set->remote];
+    l->unconfirmed = each && set->answer == ANSWER_NONE;
+    l->answered = each && !l->unconfirmed;
+    l->window = l->unconfirmed ? WINDOW_MAX : set->window ? set->window : l->usual_window;
+}
+
+static void set_usual(struct line *l)
+{
+    const struct sending_settings usual = {0};
+    line_set(l, &usual);
+}
+
 void line_init(struct line *l, const struct settings *set, struct counters *counters, struct events *events)
 {
     l->counters = counters;
@@ -18,8 +34,9 @@ void line_init(struct line *l, const struct settings *set, struct counters *coun
     l->codec = set->codec;
     l->sync = set->sync;
     l->answer_timeout_ns = set->answer_timeout_ns;
-    l->window = l->usual_window = set->window;
+    l->usual_window = set->window;
     l->out_until_ns = NEVER;
+    set_usual(l);
 }
 
 /* --- what the port takes in part ------------------------------------------------------------- */
@@ -41,16 +58,12 @@ static void out_cut(struct line *l)
     l->out_until_ns = NEVER;
 }
 
-/* How the device wants its frames; until the port is detached. */
-void line_set(struct line *l, const struct sending_settings *set)
-{
-    l->window = set->window ? set->window : l->usual_window;
-}
-
 /* The port is gone or new. The caller has taken everything out of flight before. */
 void line_reset(struct line *l)
 {
-    l->window = l->usual_window;
+    l->counters->tx_dropped[TX_UNANSWERED] += l->unwritten;
+    l->unwritten = 0;
+    set_usual(l);
     out_cut(l);
     l->resyncing = l->silent = false;
 }
@@ -97,7 +110,10 @@ static void out_within(struct line *l, int64_t until_ns)
 static struct inflight *inflight_push(struct line *l, enum inflight_kind kind, int64_t deadline_ns)
 {
     struct inflight *in = &l->inflight[(l->inflight_head + l->inflight_count++) % INFLIGHT_MAX];
-    *in = (struct inflight){.kind = kind, .deadline_ns = deadline_ns, .noise = line_noise(l)};
+    in->kind = kind;
+    in->prefix_length = 0;
+    in->deadline_ns = deadline_ns;
+    in->noise = line_noise(l);
     return in;
 }
 
@@ -115,21 +131,30 @@ void line_send_command(struct line *l, const struct command *c, enum inflight_ki
     l->out_end += c->length;
 }
 
-/* The same for a frame, which is in flight only if the device answers each. `deadline_ns`: its greatest age.
+/* The same for a frame, which is in flight only if the device answers it. `deadline_ns`: its greatest age.
  * -> false: this protocol cannot say it */
 bool line_send_frame(struct line *l, const struct tx_frame *tx, int64_t deadline_ns, int64_t now)
 {
-    size_t n = l->codec->encode(&tx->frame, l->out + l->out_end);
+    size_t n = l->encode(&tx->frame, l->out + l->out_end);
     if (!n)
         return false;
-    if (l->codec->confirms == CONFIRMS_EACH) {
+    if (l->answered) {
         struct inflight *in = inflight_push(l, INFLIGHT_FRAME, now + l->answer_timeout_ns);
         in->accept = ACCEPT_OK | ACCEPT_REFUSED;
         in->tx = *tx;
+    } else {
+        l->unwritten += l->unconfirmed;
     }
     out_within(l, tx->born_ns + deadline_ns + 1);
     l->out_end += n;
     return true;
+}
+
+/* Whether this protocol has words for the frame, though the device may not know them. */
+bool line_can_say(const struct line *l, const struct can_frame *frame)
+{
+    uint8_t words[CODEC_FRAME_MAX];
+    return l->codec->encode[REMOTE_PLAIN](frame, words);
 }
 
 /* EINTR: again. EAGAIN: when epoll says so. Anything else: the port is gone. -> 0, or errno of a port that is gone */
@@ -147,6 +172,8 @@ int line_flush(struct line *l, int port)
     }
     l->out_start = l->out_end = 0;
     l->out_until_ns = NEVER;
+    l->counters->unconfirmed += l->unwritten;
+    l->unwritten = 0;
     return 0;
 }
 

@@ -42,7 +42,11 @@ struct line {
     const struct codec *codec;
     struct command sync;
     int64_t answer_timeout_ns;
+    size_t (*encode)(const struct can_frame *frame, uint8_t *out);
     uint32_t window, usual_window;
+    bool answered;      /* a frame is in flight until the device answers it */
+    bool unconfirmed;   /* the device never tells of a frame */
+    uint32_t unwritten; /* with `unconfirmed`: frames in `out` */
     uint8_t out[OUT_BUFFER];
     size_t out_start, out_end;
     int64_t out_until_ns; /* what is in `out` must be gone by then */
@@ -63,6 +67,7 @@ bool line_say(struct line *l, const uint8_t *words, size_t length);
 
 void line_send_command(struct line *l, const struct command *c, enum inflight_kind kind, int64_t now);
 bool line_send_frame(struct line *l, const struct tx_frame *tx, int64_t deadline_ns, int64_t now);
+bool line_can_say(const struct line *l, const struct can_frame *frame);
 int line_flush(struct line *l, int port);
 void line_finish(struct line *l, int64_t now);
 

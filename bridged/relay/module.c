@@ -24,6 +24,7 @@ static const struct {
     {"WINDOW_MAX", WINDOW_MAX},
 };
 
+enum { BITRATE_LEAST = 1000 };
 enum { EVENTS_BATCH = 32 }; /* taken at once, with the lock */
 static_assert(EVENTS_MAX % EVENTS_BATCH == 0, "events() returns EVENTS_MAX at most");
 
@@ -357,11 +358,13 @@ static int name_find(const char *const *list, int n, const char *what, const cha
 
 static PyObject *Relay_set_sending(PyObject *self, PyObject *args, PyObject *kwargs)
 {
-    static char *names[] = {"", "", "window", NULL};
+    static char *names[] = {"", "", "window", "bitrate", "depth", "retries", "long_stamps", NULL};
     struct sending_settings set = {0};
     const char *answer_name, *remote_name;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "ss$O&:set_sending", names, &answer_name, &remote_name,
-                                     uint32_from, &set.window))
+    int retries, long_stamps;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "ss$O&O&O&pp:set_sending", names, &answer_name, &remote_name,
+                                     uint32_from, &set.window, uint32_from, &set.bitrate, uint32_from, &set.depth,
+                                     &retries, &long_stamps))
         return NULL;
     int answer = name_find(ANSWER_NAMES, ANSWERS, "confirmation", answer_name);
     int remote = answer < 0 ? -1 : name_find(REMOTE_NAMES, REMOTES, "way to send remote frames", remote_name);
@@ -371,7 +374,17 @@ static PyObject *Relay_set_sending(PyObject *self, PyObject *args, PyObject *kwa
         PyErr_Format(PyExc_ValueError, "window is 1 to %d, or 0 for what the relay was made with", WINDOW_MAX);
         return NULL;
     }
+    if (set.bitrate && (set.bitrate < BITRATE_LEAST || set.depth < 1 || set.depth > DEPTH_MAX)) {
+        PyErr_Format(PyExc_ValueError, "a bit rate is %d bit/s or more, depth 1 to %d", BITRATE_LEAST, DEPTH_MAX);
+        return NULL;
+    }
+    if (answer == ANSWER_NONE && !set.bitrate) {
+        PyErr_SetString(PyExc_ValueError, "frames that are not answered go by the bit rate");
+        return NULL;
+    }
     set.answer = (enum answer)answer;
+    set.retries = retries;
+    set.long_stamps = long_stamps;
     set.remote = (enum remote)remote;
     relay_set_sending(self_relay(self), &set);
     Py_RETURN_NONE;

@@ -82,7 +82,7 @@ PyObject *module_encode(PyObject *Py_UNUSED(module), PyObject *args)
     if (codec && data.len == sizeof frame) {
         uint8_t out[CODEC_FRAME_MAX];
         memcpy(&frame, data.buf, sizeof frame);
-        result = PyBytes_FromStringAndSize((const char *)out, (Py_ssize_t)codec->encode(&frame, out));
+        result = PyBytes_FromStringAndSize((const char *)out, (Py_ssize_t)codec->encode[REMOTE_PLAIN](&frame, out));
     } else if (codec) {
         PyErr_SetString(PyExc_ValueError, "a frame has the 16 bytes of struct can_frame");
     }

@@ -19,6 +19,7 @@ void receive_init(struct receive *rc, struct transmit *transmit)
     rc->transmit = transmit;
     rc->codec = transmit->line->codec;
     rc->stalled_ns = rc->retry_at_ns = rc->quiet_at_ns = NEVER;
+    rc->decoder.short_stamps = true;
     for (int i = 0; i < RX_BATCH; i++) {
         rc->iov[i] = (struct iovec){&rc->frames[i], sizeof rc->frames[i]};
         rc->msg[i].msg_hdr = (struct msghdr){.msg_iov = &rc->iov[i], .msg_iovlen = 1};
@@ -29,7 +30,7 @@ void receive_init(struct receive *rc, struct transmit *transmit)
 void receive_reset(struct receive *rc)
 {
     rc->receiving = rc->stamp_seen = false;
-    rc->decoder = (struct codec_state){0};
+    rc->decoder = (struct codec_state){.short_stamps = true};
     rc->quiet_at_ns = NEVER;
     if (!rc->in_length)
         return;
@@ -42,6 +43,12 @@ void receive_reset(struct receive *rc)
 void receive_set(struct receive *rc, bool receiving)
 {
     rc->receiving = receiving;
+}
+
+/* Until the port is detached. */
+void receive_set_stamps(struct receive *rc, bool longer)
+{
+    rc->decoder.short_stamps = !longer;
 }
 
 /* --- to the interface ------------------------------------------------------------------------ */
@@ -166,6 +173,7 @@ int receive_decode(struct receive *rc, int interface, int64_t now)
     struct can_frame spare;
     struct codec_message msg;
     size_t at = 0, used;
+    bool paced = rc->transmit->pace->depth;
     int error = 0;
 
     for (; at < rc->in_length; at += used) {
@@ -175,6 +183,8 @@ int receive_decode(struct receive *rc, int interface, int64_t now)
         used = rc->codec->decode(&rc->decoder, rc->in + at, rc->in_length - at, frame, &msg);
         if (!used)
             break;
+        if (paced && msg.kind == CODEC_FRAME)
+            pace_heard(rc->transmit->pace, frame, now);
         if (msg.kind == CODEC_FRAME)
             take_frame(rc, frame, &msg);
         else if (msg.kind == CODEC_SKIPPED)

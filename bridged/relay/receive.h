@@ -34,6 +34,7 @@ struct receive {
 void receive_init(struct receive *rc, struct transmit *transmit);
 void receive_reset(struct receive *rc);
 void receive_set(struct receive *rc, bool receiving);
+void receive_set_stamps(struct receive *rc, bool longer);
 void receive_drop(struct receive *rc, enum rx_drop reason);
 ssize_t receive_read(struct receive *rc, int port);
 int receive_decode(struct receive *rc, int interface, int64_t now);

@@ -42,6 +42,7 @@ struct relay {
     struct line line;
     struct ack_window ack;
     struct level_window level;
+    struct pace pace;
     struct transmit transmit;
     struct receive receive;
     struct intake intake;
@@ -144,7 +145,7 @@ struct relay *relay_new(const struct settings *set)
     line_init(&r->line, set, &r->counters, &r->events);
     ack_window_init(&r->ack, &r->queue, &r->line);
     level_window_init(&r->level, &r->queue, &r->line);
-    transmit_init(&r->transmit, &r->queue, &r->line, &r->ack, &r->level);
+    transmit_init(&r->transmit, &r->queue, &r->line, &r->ack, &r->level, &r->pace);
     receive_init(&r->receive, &r->transmit);
     intake_init(&r->intake, &r->queue, &r->events);
     return r;
@@ -303,6 +304,7 @@ void relay_set_sending(struct relay *r, const struct sending_settings *set)
 {
     lock(r);
     transmit_set_sending(&r->transmit, set);
+    receive_set_stamps(&r->receive, set->long_stamps);
     unlock_wake(r);
 }
 

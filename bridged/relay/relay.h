@@ -8,7 +8,8 @@
  *
  * Each part of the relay has its own files and owns its struct; their includes go one way:
  *   counters.h, events <- queue <- line <- ack_window, level_window <- transmit <- receive <- relay
- *                         queue <- intake <- relay */
+ *                         queue <- intake <- relay
+ *                         pace <- transmit */
 #ifndef CAN_BRIDGE_RELAY_H
 #define CAN_BRIDGE_RELAY_H
 

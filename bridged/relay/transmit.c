@@ -5,7 +5,7 @@
 #include <string.h>
 
 void transmit_init(struct transmit *t, struct queue *queue, struct line *line, struct ack_window *ack,
-                   struct level_window *level)
+                   struct level_window *level, struct pace *pace)
 {
     t->counters = line->counters;
     t->events = line->events;
@@ -13,6 +13,7 @@ void transmit_init(struct transmit *t, struct queue *queue, struct line *line, s
     t->line = line;
     t->ack = ack;
     t->level = level;
+    t->pace = pace;
     t->answers_each = line->codec->confirms == CONFIRMS_EACH;
 }
 
@@ -149,6 +150,7 @@ void transmit_reset(struct transmit *t)
     line_reset(t->line);
     ack_window_reset(t->ack);
     level_window_reset(t->level);
+    pace_reset(t->pace);
 }
 
 /* The port is new, or that of a device whose cut is not to be finished. */
@@ -179,7 +181,8 @@ bool transmit_command(struct transmit *t, const struct command *command)
 void transmit_set_sending(struct transmit *t, const struct sending_settings *set)
 {
     line_set(t->line, set);
-    ack_window_set(t->ack, set->answer);
+    ack_window_set(t->ack, set);
+    pace_set(t->pace, set);
 }
 
 void transmit_poll(struct transmit *t, const struct command *poll, int64_t interval_ns)
@@ -232,6 +235,12 @@ static int look_for_missing(struct transmit *t, int64_t now)
 
     if (l->resyncing)
         return line_at(l, l->inflight_count - 1)->deadline_ns <= now ? resync_again(t, now) : 0;
+    if (l->unconfirmed) { /* no frame waits for an answer, for which a late one could be taken */
+        while (l->inflight_count && line_at(l, 0)->deadline_ns <= now)
+            oldest_unanswered(t);
+        t->late_answer_possible = false;
+        return 0;
+    }
     while (l->inflight_count && line_at(l, 0)->deadline_ns <= now) {
         bool kept = keeps_its_place(line_at(l, 0), live);
         if (!kept)
@@ -251,6 +260,8 @@ static bool frame_ready(const struct transmit *t, int64_t now)
 {
     if (t->line->silent || !queue_waiting(t->queue))
         return false;
+    if (!pace_open(t->pace, now))
+        return false;
     return t->answers_each ? ack_window_open(t->ack, now) : level_window_open(t->level);
 }
 
@@ -261,15 +272,18 @@ static void send_frame(struct transmit *t, int64_t now)
     const struct tx_frame tx = again ? queue_retry_pop(q) : queue_pop(q);
 
     t->polled = false;
-    if (queue_expired(q, &tx, now)) { /* it stood behind a younger one, where queue_expire() does not look */
+    /* it stood behind a younger one, where queue_expire() does not look; or would be too old when it leaves */
+    if (queue_expired(q, &tx, pace_leaves(t->pace, now))) {
         queue_drop(q, again ? TX_REFUSED : TX_STALE);
         return;
     }
     t->counters->retries += again;
     if (!line_send_frame(t->line, &tx, q->set.deadline_ns, now))
-        queue_drop(q, TX_MALFORMED);
+        queue_drop(q, line_can_say(t->line, &tx.frame) ? TX_REMOTE : TX_MALFORMED);
     else if (!t->answers_each)
         level_window_sent(t->level, &tx);
+    else if (t->pace->depth)
+        pace_sent(t->pace, &tx.frame, now);
 }
 
 /* A poll is due. After one a frame goes first: a busy bus must not keep frames from going. */
@@ -349,18 +363,21 @@ int64_t transmit_deadline(const struct transmit *t, bool receiving)
 {
     const struct line *l = t->line;
     int64_t at = line_deadline(l);
-    if (l->silent || t->ack->checking || l->out_start || !line_window_open(l))
+    if (l->silent || t->ack->checking || l->out_start || !line_has_room(l) || !line_window_open(l))
         return at;
     if (t->poll.length && receiving && !t->polling && t->poll_at_ns < at)
         at = t->poll_at_ns;
     int64_t frame_at = t->answers_each ? ack_window_deadline(t->ack) : level_window_deadline(t->level);
+    int64_t paced_at = queue_waiting(t->queue) ? pace_deadline(t->pace) : NEVER;
+    if (paced_at != NEVER && (frame_at == NEVER || frame_at < paced_at))
+        frame_at = paced_at;
     return frame_at < at ? frame_at : at;
 }
 
 /* Frames read from the interface of which nobody knows yet what becomes of them. */
 uint32_t transmit_queued(const struct transmit *t)
 {
-    uint32_t n = t->queue->waiting_count + t->queue->retry_count + t->level->sent_count;
+    uint32_t n = t->queue->waiting_count + t->queue->retry_count + t->level->sent_count + t->line->unwritten;
     for (uint32_t i = 0; i < t->line->inflight_count; i++)
         n += line_at(t->line, i)->kind == INFLIGHT_FRAME;
     return n;

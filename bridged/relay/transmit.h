@@ -4,6 +4,7 @@
 
 #include "ack_window.h"
 #include "level_window.h"
+#include "pace.h"
 
 enum { COMMANDS_MAX = 32 }; /* ring: commands from Python that wait for their turn */
 
@@ -14,6 +15,7 @@ struct transmit {
     struct line *line;
     struct ack_window *ack;     /* both are there; frames use the one that codec->confirms says */
     struct level_window *level;
+    struct pace *pace;
     bool answers_each; /* CONFIRMS_EACH */
     struct command commands[COMMANDS_MAX];
     uint32_t command_head, command_count;
@@ -26,7 +28,7 @@ struct transmit {
 };
 
 void transmit_init(struct transmit *t, struct queue *queue, struct line *line, struct ack_window *ack,
-                   struct level_window *level);
+                   struct level_window *level, struct pace *pace);
 void transmit_reset(struct transmit *t);
 void transmit_forget(struct transmit *t);
 bool transmit_command(struct transmit *t, const struct command *command);

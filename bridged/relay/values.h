@@ -6,6 +6,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "codec.h"
 #include "counters.h"
 
 /* Times are nanoseconds on the relay's clock, see clock.h. */
@@ -15,6 +16,7 @@
 enum {
     QUEUE_MAX = 65536, /* frames that wait for the device, as configured */
     WINDOW_MAX = 32,   /* frames and commands unanswered, as configured */
+    DEPTH_MAX = 128,   /* frames in the buffer of a device, where they are reckoned */
     COMMAND_SIZE = 64, /* bytes of one command, and of one frame as it is sent */
     PREFIX_MAX = 4,    /* bytes by which a text is known to be a command's answer */
     EVENT_SIZE = 256,  /* bytes of text in one event */
@@ -55,7 +57,11 @@ struct settings {
 struct sending_settings {
     enum answer answer;
     enum remote remote;
-    uint32_t window; /* frames and commands unanswered; 0: settings.window */
+    uint32_t window;  /* frames and commands unanswered; 0: settings.window */
+    uint32_t bitrate; /* bit/s: frames go no faster than a bus of this rate takes them; 0: as the answers come */
+    bool retries;     /* a refused frame is sent again; else it may have been on the bus */
+    bool long_stamps; /* a received frame may have a time stamp of 8 digits */
+    uint32_t depth;   /* with a bitrate: frames in the device's own buffer at once */
 };
 
 struct level_settings {

@@ -24,7 +24,7 @@ static size_t encode_all(const struct codec *codec)
 {
     size_t n = 0;
     for (size_t i = 0; i < FRAMES; i++)
-        n += codec->encode(&frames[i], wire + n);
+        n += codec->encode[REMOTE_PLAIN](&frames[i], wire + n);
     return n;
 }
 

@@ -29,7 +29,7 @@ static void frame_check(const struct entry *entry, const uint8_t *line)
     const struct can_frame *frame = &entry->frame;
     uint8_t *out = malloc(codec->frame_max);
     expect(out != NULL, "out of memory");
-    size_t n = codec->encode(frame, out);
+    size_t n = codec->encode[REMOTE_PLAIN](frame, out);
     size_t dlc_at = frame->can_id & CAN_EFF_FLAG ? 9 : 4;
 
     expect(n > dlc_at && n <= codec->frame_max, "a frame decoded cannot be encoded");

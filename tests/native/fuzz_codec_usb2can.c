@@ -24,7 +24,7 @@ static bool frame_says(const struct can_frame *frame, const uint8_t *at, size_t 
 {
     uint8_t out[16];
     struct can_frame sent = *frame;
-    size_t length = codec->encode(&sent, out);
+    size_t length = codec->encode[REMOTE_PLAIN](&sent, out);
     bool extended = frame->can_id & CAN_EFF_FLAG, remote = frame->can_id & CAN_RTR_FLAG;
     size_t low = extended ? 4 : 2;
     uint8_t below = extended ? 0x07 : 0x1F, rtr = extended ? 0x04 : 0x10;

@@ -412,7 +412,7 @@ static size_t encode(const struct can_frame *frame, char *line)
     if (!out)
         abort();
     memset(out, '?', codec->frame_max);
-    size_t n = codec->encode(frame, out);
+    size_t n = codec->encode[REMOTE_PLAIN](frame, out);
     memcpy(line, out, codec->frame_max);
     free(out);
     return n;

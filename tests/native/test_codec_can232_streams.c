@@ -8,7 +8,7 @@ static const struct codec *const codec = &codec_can232;
 
 static size_t encode(const struct can_frame *frame, char *line)
 {
-    return codec->encode(frame, (uint8_t *)line);
+    return codec->encode[REMOTE_PLAIN](frame, (uint8_t *)line);
 }
 
 static void random_frame(uint64_t *random, struct can_frame *frame)

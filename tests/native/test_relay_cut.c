@@ -86,7 +86,7 @@ static struct bench bench_new(const struct kind *kind, size_t taken)
     for (unsigned i = 0; i < FRAMES; i++) {
         struct can_frame frame = {.can_id = 0x123, .len = 8};
         memset(frame.data, 0xA0 + (int)i, 8);
-        b.lengths[i] = kind->codec->encode(&frame, b.frames[i]);
+        b.lengths[i] = kind->codec->encode[REMOTE_PLAIN](&frame, b.frames[i]);
         if (__real_write(b.far[1], &frame, sizeof frame) != sizeof frame)
             abort();
     }

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
-from benches.relay import Rig, can_frame
+from benches.relay import EFF_FLAG, FRAME, Rig, can_frame
 
 from bridged import _relay
 from bridged.adapters.base import Confirms, Remote, Sending
+from bridged.bridge.loop import set_sending
 
 GIVEN = ("tx_frames", "tx_queued", "tx_unconfirmed")
 COUNTER = {
@@ -27,14 +29,9 @@ def rig() -> Iterator[Rig]:
     r.close()
 
 
-def set_sending(rig: Rig, sending: Sending) -> None:
-    """As bridge.py does."""
-    rig.relay.set_sending(sending.confirms.value, sending.remote.value, window=sending.window or 0)
-
-
 @pytest.mark.parametrize("confirms", set(Confirms) - {Confirms.NOTHING})
 def test_each_confirmation_has_its_counter(rig: Rig, confirms: Confirms) -> None:
-    set_sending(rig, Sending(confirms))
+    set_sending(rig.relay, Sending(confirms))
     rig.bus.send(can_frame(1))
     rig.turn()
     assert rig.counters()["queued"] == 1
@@ -45,7 +42,7 @@ def test_each_confirmation_has_its_counter(rig: Rig, confirms: Confirms) -> None
 
 
 def test_another_port_is_that_of_a_can232_again(rig: Rig) -> None:
-    set_sending(rig, Sending(Confirms.QUEUED, window=3))
+    set_sending(rig.relay, Sending(Confirms.QUEUED, window=3))
     rig.attach()
     for number in range(2):
         rig.bus.send(can_frame(number))
@@ -57,23 +54,115 @@ def test_another_port_is_that_of_a_can232_again(rig: Rig) -> None:
 
 
 def test_a_window_of_the_devices_own(rig: Rig) -> None:
-    set_sending(rig, Sending(Confirms.QUEUED, window=3))
+    set_sending(rig.relay, Sending(Confirms.QUEUED, window=3))
     for number in range(5):
         rig.bus.send(can_frame(number))
     rig.turn()
     assert len(rig.said()) == 3
 
 
-def test_what_is_no_setting_is_refused(rig: Rig) -> None:
-    with pytest.raises(ValueError, match="no confirmation is named 'never'"):
-        rig.relay.set_sending("never", "plain", window=0)
-    with pytest.raises(ValueError, match="no way to send remote frames is named 'some'"):
-        rig.relay.set_sending("taken", "some", window=0)
-    with pytest.raises(ValueError, match=f"window is 1 to {_relay.WINDOW_MAX}"):
-        rig.relay.set_sending("taken", "plain", window=_relay.WINDOW_MAX + 1)
+@pytest.mark.parametrize(
+    ("confirms", "remote", "numbers", "why"),
+    [
+        ("never", "plain", {}, "no confirmation is named 'never'"),
+        ("taken", "some", {}, "no way to send remote frames is named 'some'"),
+        ("taken", "plain", {"window": _relay.WINDOW_MAX + 1}, f"window is 1 to {_relay.WINDOW_MAX}"),
+        ("taken", "plain", {"bitrate": 999}, "a bit rate is 1000 bit/s or more"),
+        ("taken", "plain", {"bitrate": 1000, "depth": 129}, "depth 1 to 128"),
+        ("nothing", "plain", {}, "frames that are not answered go by the bit rate"),
+    ],
+)
+def test_what_is_no_setting_is_refused(
+    rig: Rig, confirms: str, remote: str, numbers: dict[str, int], why: str
+) -> None:
+    plain: Any = {"window": 0, "bitrate": 0, "depth": 1, "retries": True, "long_stamps": False}
+    with pytest.raises(ValueError, match=why):
+        rig.relay.set_sending(confirms, remote, **{**plain, **numbers})
 
 
 @pytest.mark.parametrize("remote", Remote)
 @pytest.mark.parametrize("confirms", Confirms)
 def test_adapters_and_relay_have_the_same_words(rig: Rig, confirms: Confirms, remote: Remote) -> None:
-    set_sending(rig, Sending(confirms, remote))
+    set_sending(rig.relay, Sending(confirms, remote, paced_bitrate=500_000))
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_a_refused_frame_that_may_have_been_on_the_bus_is_not_sent_again(rig: Rig, window: int) -> None:
+    """WeAct refuses for each error on the bus, and goes on trying: CR may come after it."""
+    set_sending(rig.relay, Sending(Confirms.SENT, window=window, retries=False))
+    sent = []
+    for number in range(8):
+        rig.bus.send(can_frame(number))
+        rig.turn()
+    for answer in (b"\r", b"\a", b"\a", b"\r", b"\r", b"\a", b"\r", b"\r", b"\r"):
+        sent += rig.said()
+        rig.port.send(answer)
+        rig.turn(30)
+    counters = rig.counters()
+    assert len(sent) == len(set(sent)) == 8
+    assert b"V" not in sent
+    assert (counters["tx_frames"], counters["refused"], counters["tx_retries"]) == (5, 3, 0)
+    assert counters["stray_answers"] == 1
+    assert [kind for kind, _, _ in rig.events()] == [_relay.EVENT_FRAME_REFUSED]
+
+
+def test_a_device_that_refuses_all_for_good_is_stuck(rig: Rig) -> None:
+    set_sending(rig.relay, Sending(Confirms.SENT, retries=False))
+    for number in range(30):
+        rig.bus.send(can_frame(number))
+        rig.turn(40)
+        rig.port.send(b"\a")
+        rig.turn()
+    assert [kind for kind, _, _ in rig.events()].count(_relay.EVENT_STUCK) == 1
+
+
+REMOTE = [(0x123, 0), (0x123, 1), (0x123, 8), (EFF_FLAG | 0x123, 0), (EFF_FLAG | 0x123, 4)]
+
+
+@pytest.mark.parametrize(
+    ("remote", "lines", "dropped"),
+    [
+        (Remote.PLAIN, [b"r1230", b"r1231", b"r1238", b"R000001230", b"R000001234"], 0),
+        (
+            Remote.WITH_DIGITS,
+            [b"r1230", b"r123100", b"r1238" + b"0" * 16, b"R000001230", b"R00000123400000000"],
+            0,
+        ),
+        (Remote.NO_STANDARD, [b"R000001230", b"R000001234"], 3),
+        (Remote.NONE, [], 5),
+    ],
+)
+def test_remote_frames_as_the_device_wants_them(
+    rig: Rig, remote: Remote, lines: list[bytes], dropped: int
+) -> None:
+    set_sending(rig.relay, Sending(Confirms.ALWAYS, remote, window=32))
+    rig.bus.send(FRAME.pack(0x123, 1, b"\x55"))
+    for can_id, dlc in REMOTE:
+        rig.bus.send(FRAME.pack(0x40000000 | can_id, dlc, b""))
+        rig.turn()
+    assert rig.said() == [b"t123155", *lines]
+    rig.port.send(b"\r" * 6)
+    rig.turn()
+    counters = rig.counters()
+    assert (counters["remote-frame"], counters["malformed"], counters["queued"]) == (dropped, 0, 0)
+    assert counters["tx_unconfirmed"] == 1 + len(lines)
+
+
+def test_what_no_protocol_can_say_is_no_remote_frame(rig: Rig) -> None:
+    set_sending(rig.relay, Sending(Confirms.ALWAYS, Remote.NO_STANDARD))
+    rig.bus.send(FRAME.pack(0x40000123, 9, b""))
+    rig.turn()
+    assert (rig.counters()["malformed"], rig.counters()["remote-frame"]) == (1, 0)
+
+
+@pytest.mark.parametrize("line", [b"t1232AABB", b"r1233", b"r1233000000", b"T000001231AA", b"R000001231"])
+@pytest.mark.parametrize(("digits", "longer"), [(0, False), (4, False), (8, True)])
+def test_time_stamps_as_the_device_has_them(rig: Rig, line: bytes, digits: int, longer: bool) -> None:
+    """Eight digits where none can be are a broken line: a DLC of 4 that was 8 looks like that."""
+    for long_stamps in (False, True):
+        set_sending(rig.relay, Sending(long_stamps=long_stamps))
+        rig.port.send(line + b"0001E240"[:digits] + b"\r")
+        rig.turn()
+        understood = long_stamps or not longer
+        assert len(rig.frames()) == understood
+    assert rig.counters()["skipped_messages"] == longer

@@ -219,6 +219,11 @@ class TestText:
             "  can-bridge  version 1.2.3",
         ]
 
+    def test_what_the_adapter_does_not_vouch_for_is_named_apart(self) -> None:
+        counters = snapshot()["counters"] | {"tx_frames": 1, "tx_queued": 7, "tx_unconfirmed": 2}
+        text = render(snapshot(counters=counters))
+        assert "  sent        1 frames, 7 queued, 2 unconfirmed to the adapter, 42/s," in text
+
     def test_what_is_not_known(self) -> None:
         bus = snapshot()["bus"] | {"open": False}
         lines = render(

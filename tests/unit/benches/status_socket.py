@@ -15,7 +15,15 @@ from bridged.daemon.status import StatusServer
 
 def snapshot(name: str = "can232", **changes: Any) -> dict[str, Any]:
     """The status of a bridge that runs."""
-    counters = {"rx_frames": 20, "tx_frames": 84, "rx_errors": 0, "rx_overruns": 0, "tx_retries": 1}
+    counters = {
+        "rx_frames": 20,
+        "tx_frames": 84,
+        "tx_queued": 0,
+        "tx_unconfirmed": 0,
+        "rx_errors": 0,
+        "rx_overruns": 0,
+        "tx_retries": 1,
+    }
     dropped = {"tx_dropped": {"queue-full": 0, "stale": 0}, "rx_dropped": {"not-running": 0}}
     return {
         "version": "1.2.3",
