@@ -106,6 +106,8 @@ class Relay:
         """Whether frames from the device go to the interface, and what happens to those from it."""
     def set_queue(self, queue: int, deadline: float, stuck: float, /) -> None:
         """All three anew; frames for which there is no room any more are dropped, the newest first."""
+    def set_sync(self, sync: bytes, prefix: bytes, /) -> None:
+        """Another sync command than that which the relay was made with."""
     def set_polling(self, request: bytes, prefix: bytes, interval: float, /) -> None:
         """Ask the device for frames with `request` until the port is detached."""
     def set_sending(

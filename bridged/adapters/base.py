@@ -112,6 +112,7 @@ class Identity(NamedTuple):
 
     version: str | None = None
     serial_number: str | None = None
+    firmware: str | None = None  # the name of its profile, where a type of adapter has several
 
 
 class Happened(enum.Flag):
@@ -155,12 +156,16 @@ class Adapter(Protocol):
 
     codec: str
     baudrate: int  # of a serial line, bit/s
-    sync: Exchange  # its answer cannot be taken for any other
+    sync: Exchange  # its answer cannot be taken for any other; after init_steps it may be another one
     answer_timeout_s: float  # for the answer to a frame
     identity: Identity
     polling: Polling | None  # known after init_steps, as is
     flow: Flow | None  # None: the device answers each frame
-    sending: Sending  # known after init_steps
+    sending: Sending  # known after init_steps, as are the next four
+    sent_means: str | None  # a sentence: what the device vouches for when a frame counts as sent
+    cautions: tuple[str, ...]  # what this device does otherwise than its user would think
+    tells_full: bool  # whether its buffer is. False: every refusal of a frame may mean that
+    stops: bool  # a closed channel is off its CAN bus
     discarded: int  # frames that it took and threw away, as far as it tells
 
     @property

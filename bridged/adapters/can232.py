@@ -1,4 +1,7 @@
-"""LAWICEL CAN232 and devices that speak its ASCII protocol (CAN232 manual, version 3)."""
+"""LAWICEL CAN232 and devices that speak its ASCII protocol (CAN232 manual, version 3).
+
+What is particular to a firmware is in its profile (adapters/firmware), which recognition.py chooses.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,16 @@ import functools
 import logging
 import re
 from collections.abc import Mapping  # noqa: TC003 - msgspec looks at the annotations
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from msgspec import Meta
 
+from bridged.adapters import firmware
 from bridged.adapters.base import (
     UNKNOWN,
     Answer,
     Baudrate,
+    Confirms,
     Exchange,
     Flow,
     Happened,
@@ -29,81 +34,31 @@ from bridged.adapters.base import (
     TypeName,
     pause,
 )
-from bridged.can import BusState
+from bridged.adapters.can232_eeprom import Eeprom, may_be_stored
+from bridged.adapters.firmware.profile import BITRATES, Command
+from bridged.adapters.recognition import ANYTHING, Recognition, question
+from bridged.can import STANDARD_REGISTERS, BusState
 from bridged.errors import AdapterError, WrongDeviceError
 from bridged.settings import AdapterConfig, After
-from bridged.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
+    from bridged.adapters.firmware.profile import Profile
     from bridged.can import BitTiming
     from bridged.settings import ChannelConfig, TransmitConfig
 
 log = logging.getLogger(__name__)
 
 OK, REFUSED, TEXT, NONE = Reply.OK, Reply.REFUSED, Reply.TEXT, Reply.NONE
-ANYTHING = (OK, REFUSED, TEXT, NONE)
 
 LONGEST_LINE = 27  # "T1FFFFFFF81122334455667788\r"
 RECEIVE_FIFO = 32  # frames that may be on their way out before an answer (manual 1.3)
-AUTO_POLL_SINCE = "1220"  # hhss of the first firmware with X (manual 2.0, P and A)
 POLL_INTERVAL_S = 0.01
-TRANSMIT_FIFO = 8  # frames (manual 1.3)
 COMMANDS_MAX = 2  # that the buffer of its serial line holds (manual)
 LONGEST_FRAME_BITS = 160  # extended, 8 bytes, as many stuff bits as there can be, the pause behind it
-
-# A command that a crashed program left half typed may be in the device's buffer. A CR would finish it: a
-# frame from another time goes out on a live bus. A "C" might even complete it, being a hex digit. "V"
-# is no hex digit, makes a half command invalid, and alone only asks for the version.
-#
-# A CAN232 looks at the whole line, so as many as a line holds are enough, with their CR.
-SHORT_FLUSH = b"V" * (LONGEST_LINE - 1) + b"\r"
-
-# Other firmware may send what such a line begins with, whatever follows. But its buffer overflows, after
-# 30 to 165 characters, and then begins anew (or the line is thrown away). So more than any buffer holds, and
-# no CR before it has overflowed. In pieces that fit into a USB packet (64 bytes) each. What forgets a half
-# command after a silence (10 ms, 50 ms) has forgotten all of it after the pause.
-FLUSH_PIECE = b"V" * 50
-FLUSH_PIECES = 4
-FLUSH_PAUSE_S = 0.06
-IDENTIFY_TRIES = 4  # the first V ends the line of the flush, which a CAN232 refuses
-
-# Other firmware than a CAN232's, by what it answers: V.
-NAMES_BY_VERSION = {
-    rb"VL2K.*": "a CANable with the firmware of Nakakiyo092",
-    rb"VW1K.*": "a USB2CANFDV1 with the firmware of Nakakiyo092",
-    rb"WeAct.*": "a WeAct USB2CANFDV1",
-    rb"\+Board.*": "a CANable with the firmware of Elmue",
-    rb".*(?i:canable|cantact).*": "a CANable with slcan firmware",
-}
-# V and N, which are the same in every device of that kind.
-NAMES_BY_NUMBERS = {
-    ("V0100", "FFFF"): "a USBtin",
-    ("V1013", "4242"): "slcanpty",
-    ("V1013", "A123"): "an Arduino with slcan firmware",
-    ("V1234", "1234"): "an Arduino with slcanuino",
-    ("V1234", "2233"): "an ESP32 with esp32-slcan",
-}
-# v, which a CAN232 refuses.
-NAMES_BY_DETAILS = {rb"v01\d\d": "a USBtin", rb"v0401": "a UCCB", rb"v: .*": "the firmware of Nakakiyo092"}
-# The buffer of this one overflows with more than 30 characters: the others after it are overwritten.
-CANTACT = "CANtact"  # "CANtact dev", "CANtact b12": USB product ad50:60c4
-LONGEST_SHOWN = 120
-HEARD_KEPT = 16
-
-# What is kept in the EEPROM: what to ask of the adapter, and what it is good for; each value's name.
-EEPROM_PURPOSES = {
-    "X": ("send frames by itself", "it now sends received frames unasked"),
-    "Z": ("leave out time stamps", "received frames now take less of its line"),
-    "W": ("set the filter mode", "it now reads code and mask as channel.acceptance means them"),
-}
-EEPROM_NAMES = {
-    "X1": "auto poll",
-    "Z0": "no time stamps",
-    "W0": "filter mode dual",
-    "W1": "filter mode single",
-}
+DRAIN_LONGEST_S = 1.0
+SILENT_STEP_S = 0.02  # for a command that is never answered
 
 # F, CAN232 manual: bit -> meaning. Bit 4 is not used.
 STATUS_FLAGS = {
@@ -123,28 +78,30 @@ HAPPENED = {
     6: Happened.ARBITRATION_LOST,
     7: Happened.BUS_ERROR,
 }
+# Of a firmware without such flags.
+ANSWERS = Observation("it answers; how its bus is, its firmware does not tell")
+LOCKED = Observation(
+    "it refuses every question: its buffer is full, since nobody acknowledges its frames",
+    happened=Happened.TX_FULL,
+)
 
-BITRATE_COMMANDS: Final = {
-    10_000: "S0",
-    20_000: "S1",
-    50_000: "S2",
-    100_000: "S3",
-    125_000: "S4",
-    250_000: "S5",
-    500_000: "S6",
-    800_000: "S7",
-    1_000_000: "S8",
+SENT_MEANS = {
+    Confirms.TAKEN: "sent means taken into the adapter's transmit buffer, which closing empties",
+    Confirms.SENT: "sent means that the frame was on the CAN bus",
+    Confirms.QUEUED: "sent means taken into the adapter's buffer: what becomes of it, it does not tell",
+    Confirms.ALWAYS: "this firmware confirms also frames that it loses: sent means written to the adapter",
+    Confirms.NOTHING: "this firmware does not confirm frames: sent means written to USB",
 }
-"""bit/s → command (manual, `Sn`). Some clones set 750 kbit/s for S7."""
 
-Firmware = Annotated[Literal["can232"], Meta(description="can232")]
+Firmware = Annotated[
+    str, Meta(pattern=f"^({'|'.join(firmware.NAMES)})$", description=" or ".join(firmware.NAMES))
+]
 
 
 class Can232Config(AdapterConfig, frozen=True, kw_only=True):
     """A CAN232, and how to reach it. `port` is an absolute path or a pyserial URL; `baudrate` in bit/s.
 
-    `firmware` "can232": what is there is a CAN232 for certain; None: it may be a clone, and is treated so
-    until it has said what it is.
+    `firmware` names the profile of what is there; None: it has to say by its answers what it is.
     """
 
     type: TypeName
@@ -155,7 +112,7 @@ class Can232Config(AdapterConfig, frozen=True, kw_only=True):
 
     default_window: ClassVar[int] = 1
     default_restart = After(0.1)
-    bitrates = BITRATE_COMMANDS.keys()
+    bitrates = BITRATES.keys()
     schemes: ClassVar[tuple[str, ...]] = ("socket", "rfc2217")
     refused_schemes: ClassVar[Mapping[str, str]] = {
         "usb": "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"
@@ -183,15 +140,16 @@ class Can232Config(AdapterConfig, frozen=True, kw_only=True):
         return f"a CAN232 can hold {COMMANDS_MAX} commands, more of them may be lost"
 
     def notes(self, channel: ChannelConfig) -> list[str]:
-        """What may be written to the EEPROM, and what becomes of a clone."""
-        stored = ["X1", "Z0"]
-        acceptance = channel.acceptance
-        if acceptance is not None and not acceptance.passes_all:
-            stored.append(f"W{acceptance.single:d}")
-        names = ", ".join(f"{request} ({EEPROM_NAMES[request]})" for request in stored)
-        lines = [f"may store in the adapter's EEPROM, each only if it is not so already: {names}"]
-        if self.firmware is None:
-            lines.append("a clone that is recognised is refused at start, unless adapter.firmware is can232")
+        """What may be written to an EEPROM, what the firmware cannot do; unknown ones are refused."""
+        lines = []
+        profile = None if self.firmware is None else firmware.load(self.firmware)
+        if profile is None or profile.polls:
+            stored = may_be_stored(channel.acceptance)
+            lines.append(f"may store in a CAN232's EEPROM, each only if it is not so already: {stored}")
+        if profile is None:
+            lines.append("unknown firmware is refused at start, unless adapter.firmware says what it is")
+        elif problem := channel_problem(profile, channel):
+            lines.append(f"will be refused at start: {problem}")
         return lines
 
     @property
@@ -206,39 +164,64 @@ def make_adapter(settings: Can232Config, channel: ChannelConfig, memory: Memory)
     return Can232(settings, channel, memory)
 
 
-def bitrate_command(timing: BitTiming) -> bytes:
-    r"""`S4\r` or `s031C\r` (manual, S and s)."""
-    if timing.registers is None:
-        return f"{BITRATE_COMMANDS[timing.bitrate]}\r".encode()
-    return "s{:02X}{:02X}\r".format(*timing.registers).encode()
+def bitrate_command(profile: Profile, timing: BitTiming) -> bytes | None:
+    r"""`S4\r` or `s031C\r` (manual, S and s); None: this firmware cannot be told this timing."""
+    if timing.registers is None or (
+        # There was no other way to write a bit rate that this firmware has a command for.
+        not profile.registers and timing.bitrate not in STANDARD_REGISTERS
+    ):
+        command = profile.bitrates.get(timing.bitrate)
+        return None if command is None else f"{command}\r".encode()
+    return "s{:02X}{:02X}\r".format(*timing.registers).encode() if profile.registers else None
+
+
+def channel_problem(profile: Profile, channel: ChannelConfig) -> str | None:
+    """What this firmware cannot do of what the configuration wants."""
+    acceptance = channel.acceptance
+    if channel.listen_only and profile.listen_only is None:
+        return f"{profile.article_title} has no listen-only mode: remove channel.listen_only"
+    if bitrate_command(profile, channel.timing) is None:
+        rates = ", ".join(str(rate) for rate in sorted(profile.bitrates))
+        timing = channel.timing.description
+        return f"{profile.article_title} cannot be set to {timing}; its bit rates are {rates}"
+    if acceptance is not None and not acceptance.passes_all and not profile.acceptance:
+        return f"{profile.article_title} has no such filter: remove channel.acceptance"
+    return None
 
 
 class Can232:
-    """Sans-I/O: what to say to a CAN232. `identity` and `polling` hold what init_steps found out."""
+    """Sans-I/O: what to say to a device. `profile` and what follows from it is known after init_steps."""
 
     codec = "can232"
     flow: Flow | None = None
     discarded = 0  # it does not tell
-    sending = Sending()
 
     def __init__(self, adapter: Can232Config, channel: ChannelConfig, memory: Memory) -> None:
-        self._port = adapter.port
-        self.baudrate = adapter.baudrate
-        self._wanted_serial = adapter.serial_number
+        self._settings = adapter
         self._channel = channel
-        self._memory = memory
-        self._is_can232 = adapter.firmware == "can232"  # the user says so
-        self._flushed = self._is_can232  # no half command of another program is in the device's buffer
-        self._keep_off = False  # not a byte may be sent to what is there
-        self._heard: list[bytes] = []  # texts that answer no request, since V was asked first
-        self._noise = False  # was heard since then
-        self._stamped = False
-        self.identity = Identity()
-        self.polling: Polling | None = None
+        self.baudrate = adapter.baudrate
         # An answer may stand behind a full receive FIFO on the line: 10 bit times a character.
-        self.answer_timeout_s = 0.2 + RECEIVE_FIFO * LONGEST_LINE * 10 / adapter.baudrate
-        self._flags_step = self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F")
-        self.sync = self._step(b"V\r", "tell its version", (TEXT,), (NONE,), prefix=b"V")
+        self.answer_timeout_s = timeout_s = 0.2 + RECEIVE_FIFO * LONGEST_LINE * 10 / adapter.baudrate
+        self._recognition = Recognition(adapter.port, adapter.baudrate, adapter.firmware, timeout_s)
+        self._eeprom = Eeprom(memory, timeout_s)
+        self.profile: Profile | None = None
+        self.identity = Identity()
+        self.sending = Sending()
+        self.polling: Polling | None = None
+        self.cautions: tuple[str, ...] = ()
+        self.sync = self._ask_version(b"V")
+
+    @property
+    def sent_means(self) -> str | None:
+        return None if self.profile is None else SENT_MEANS[self.sending.confirms]
+
+    @property
+    def tells_full(self) -> bool:
+        return self.profile is None or self.profile.full_flag
+
+    @property
+    def stops(self) -> bool:
+        return self.profile is None or self.profile.stops
 
     def _step(
         self,
@@ -250,44 +233,50 @@ class Can232:
         prefix: bytes = b"",
         advice: str = "",
     ) -> Exchange:
-        return Exchange(request, purpose, accept, reject, prefix, advice, self.answer_timeout_s)
+        timeout_s = SILENT_STEP_S if accept == (NONE,) else self.answer_timeout_s
+        return question(request, purpose, timeout_s, accept, reject, prefix=prefix, advice=advice)
+
+    def _ask_version(self, prefix: bytes) -> Exchange:
+        return self._step(b"V\r", "tell its version", (TEXT,), (NONE,), prefix=prefix)
 
     # --- start and end ------------------------------------------------------------------------
 
     def init_steps(self, serial_number: str | None, product: str | None = None) -> Steps:  # noqa: ARG002
-        """Flush, identify, close, configure, open (manual 1.4), then mend what its EEPROM has wrong.
+        """Find out what is there, close, configure, open (manual 1.4); mend what a CAN232's EEPROM has wrong.
 
         Its serial number is another than that of the USB device, and told by N.
         """
         self.polling = None
-        self._keep_off = product is not None and product.startswith(CANTACT)
-        if self._keep_off:
-            msg = (
-                f"the USB device of {self._port} calls itself '{product}': no CAN232, and the "
-                f"first bytes of any flush would overwrite its memory, so nothing is sent to it"
+        found = yield from self._recognition.steps(product)
+        self.profile = profile = found.profile
+        self.identity = self._eeprom.identity = found.identity._replace(firmware=profile.name)
+        self.cautions = profile.warnings
+        if self._channel.listen_only and profile.listen_only_warning:
+            self.cautions += (profile.listen_only_warning,)
+        self.sync = self._ask_version(found.version_prefix)
+        self.sending = profile.sending
+        if profile.paced:
+            self.sending = self.sending._replace(paced_bitrate=self._channel.timing.bitrate)
+        self._refuse_unfit(profile)
+        if not found.closed:
+            yield from self._close(profile)
+        yield from self._configure(profile)
+        yield from self._open(profile)
+        if profile.polls:
+            yield from self._mend_eeprom(profile)
+
+    def _refuse_unfit(self, profile: Profile) -> None:
+        wanted, serial = self._settings.serial_number, self.identity.serial_number
+        if wanted is not None and serial != wanted:
+            found = serial or (
+                "unknown" if profile.serial_number else f"none of its own, as {profile.article_title} has"
             )
-            raise WrongDeviceError(msg)
-        if self._is_can232:
-            yield from self._flush_can232()
-            yield from self._identify()
-        else:
-            self._flushed = False
-            yield from self._flush()
-            yield from self._identify()
-            yield from self._recognise()
-        yield from self._configure()
-        yield from self._open()
-        auto_poll = yield from self._auto_poll()
-        differences = self._eeprom_differences(auto_poll)
-        if differences:
-            yield from self._close()
-            for setting, value in differences:
-                yield from self._write_eeprom(setting, value)
-            yield from self._open()
-            auto_poll = auto_poll or (yield from self._auto_poll())
-        if not auto_poll:
-            log.info("firmware without auto poll: asking for frames with A every %g s", POLL_INTERVAL_S)
-            self.polling = Polling(b"A\r", b"A", POLL_INTERVAL_S)
+            raise WrongDeviceError(
+                f"the adapter on {self._settings.port} has serial number {found}, "
+                f"adapter.serial_number wants {wanted}"
+            )
+        if problem := channel_problem(profile, self._channel):
+            raise WrongDeviceError(f"the adapter on {self._settings.port} is not used: {problem}")
 
     def close_steps(self, drain: bool) -> Steps:
         """`C` until it is certain: the first may end a half command or meet an old answer.
@@ -295,194 +284,105 @@ class Can232:
         C throws away what is in the transmit FIFO, and those frames are answered: to drain it is to wait
         until they are on the bus, if others take up no more than half of it.
         """
-        if self._keep_off:
+        recognition, profile = self._recognition, self.profile
+        if recognition.keep_off:
             return
-        if not self._flushed:  # nothing was sent to it yet but a part of the flush
-            yield from self._flush()
-            yield self.sync._replace(accept=ANYTHING, reject=())
-            self._flushed = True
-        elif drain:
-            answer = yield self.sync._replace(accept=ANYTHING, reject=())  # answered after all frames
+        ask_version = self.sync._replace(accept=ANYTHING, reject=())
+        if not recognition.flushed:  # nothing was sent to it yet but a part of the flush
+            yield from recognition.flush()
+            yield ask_version
+            recognition.flushed = True
+        elif drain and profile is not None:
+            answer = yield ask_version  # answered after all frames
             if answer.reply is TEXT:
-                yield pause(2 * TRANSMIT_FIFO * LONGEST_FRAME_BITS / self._channel.timing.bitrate)
-        yield from self._close()
-        answer = yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
+                on_bus_s = 2 * profile.buffer * LONGEST_FRAME_BITS / self._channel.timing.bitrate
+                yield pause(min(on_bus_s, DRAIN_LONGEST_S))
+        if profile is not None and profile.close_answers == (NONE,):
+            yield from self._close_unanswered(profile)
+            return
+        yield self._close_step()
+        answer = yield self._close_step()
         if answer.reply is NONE:
-            yield from self._close()
+            yield self._close_step()
 
     @property
     def last_words(self) -> bytes:
         """Nothing as long as a C might complete somebody's half command."""
-        return b"C\rC\r" if self._flushed and not self._keep_off else b""
+        return b"C\rC\r" if self._recognition.flushed and not self._recognition.keep_off else b""
 
-    def _flush(self) -> Steps:
-        """For a device of which nothing is known yet. The line is still to be ended, by `V`: a lone CR means
-        different things to different firmware (the last frame once more, the first byte of a command)."""
-        for _ in range(FLUSH_PIECES):
-            on_the_line_s = len(FLUSH_PIECE) * 10 / self.baudrate
-            yield Exchange(
-                FLUSH_PIECE, "drop a half-typed command", (NONE,), (), timeout_s=on_the_line_s
-            )  # whatever answers it is of no interest
-        yield pause(FLUSH_PAUSE_S)
+    def _close_step(self) -> Exchange:
+        return self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
 
-    def _flush_can232(self) -> Steps:
-        """Lone CRs, as the manual wants them, only once the channel is closed: on an open one some
-        clones answer them by sending their last frame again."""
-        yield self._step(SHORT_FLUSH, "drop a half-typed command", ANYTHING, (), prefix=b"V")
-        yield from self._close()
-        yield self._step(b"\r\r", "empty its command buffer", ANYTHING, ())
-
-    def _close(self) -> Steps:
-        yield self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
-
-    def _identify(self) -> Steps:
-        self._heard, self._noise = [], False
-        replies = []
-        ask = self._step(b"V\r", "tell its version", (TEXT, REFUSED, NONE), (), prefix=b"V")
-        for number in range(IDENTIFY_TRIES):
-            # An empty line may be the late answer to something else, but not each time.
-            answer = yield ask._replace(accept=ANYTHING) if number == IDENTIFY_TRIES - 1 else ask
-            self._flushed = True
-            replies.append(answer.reply)
-            if answer.reply is TEXT:
-                break
+    def _close(self, profile: Profile) -> Steps:
+        if profile.close_answers == (NONE,):
+            yield from self._close_unanswered(profile)
         else:
-            raise self._unidentified(replies)
-        version = answer.text.decode("ascii", "replace")
-        if not re.fullmatch("V[0-9A-F]{4}", version):
-            raise self._not_a_can232(answer.text)
-        answer = yield self._step(b"N\r", "tell its serial number", (TEXT, REFUSED, NONE), (), prefix=b"N")
-        serial = answer.text[1:].decode("ascii", "replace") if answer.reply is TEXT else None
-        self.identity = Identity(version, serial)
-        if self._wanted_serial is not None and serial != self._wanted_serial:
-            msg = (
-                f"the adapter on {self._port} has serial number {serial or 'unknown'}, "
-                f"adapter.serial_number wants {self._wanted_serial}"
-            )
-            raise WrongDeviceError(msg)
+            yield self._close_step()
 
-    def _unidentified(self, replies: Sequence[Reply]) -> AdapterError:
-        """Why no answer to V begins with V. Noise may look like a text, but not always like the same one."""
-        text = max(self._heard, key=self._heard.count, default=b"")
-        if text and (not self._noise or self._heard.count(text) >= IDENTIFY_TRIES - 1):
-            return self._not_a_can232(text)
-        if REFUSED in replies:
-            return AdapterError(
-                f"the adapter on {self._port} refuses every command, V too: is it a CAN232, and well?"
-            )
-        if OK in replies:
-            return WrongDeviceError(f"the device on {self._port} answers V with an empty line: not a CAN232")
-        if self._noise:
-            return AdapterError(
-                f"only noise answers V on {self._port} at {self.baudrate} Bd: is the baud rate right "
-                f"(its LEDs blink it at power-on)?"
-            )
-        return AdapterError(
-            f"no answer to V on {self._port} at {self.baudrate} Bd: is the adapter powered "
-            f"(from the CAN side, 6-16 V), the baud rate right (its LEDs blink it at power-on), "
-            f"the cable plugged?"
-        )
-
-    def _not_a_can232(self, version: bytes) -> WrongDeviceError:
-        name = _name_of(version, NAMES_BY_VERSION)
-        what = f"probably {name}, not a CAN232" if name else "not a CAN232 (Vhhss)"
-        return WrongDeviceError(f"the device on {self._port} answers V with {_shown(version)}: {what}")
-
-    def _recognise(self) -> Steps:
-        """Refuses what answers V like a CAN232 and then gives itself away. The channel is closed then.
-
-        Asks only what no known firmware takes for an order: v, and F on a closed channel. (N is asked before,
-        without digits. X, W, U, Q, A, M1 write flash, registers or pins somewhere, or start a bootloader.)
-        """
-        version, serial = self.identity.version or "", self.identity.serial_number or ""
-        if name := NAMES_BY_NUMBERS.get((version, serial)):
-            raise self._clone(f"V with '{version}' and N with 'N{serial}'", name)
-        answer = yield self._step(
-            b"v\r", "tell its version in detail", (TEXT, REFUSED, NONE), (), prefix=b"v"
-        )
-        if answer.reply is TEXT:
-            name = _name_of(answer.text, NAMES_BY_DETAILS)
-            raise self._clone(f"v with {_shown(answer.text)}", name)
-        for _ in range(2):  # a CAN232 answers F, too, if C did not reach it
-            yield from self._close()
-            self._heard = []
-            answer = yield self._flags_step
-            flags = answer.text if answer.reply is TEXT else b"".join(self._heard[-1:])
-            if not flags:
-                return
-        raise self._clone(f"F with {_shown(flags)} while its channel is closed", None)
-
-    def _clone(self, seen: str, name: str | None) -> WrongDeviceError:
-        return WrongDeviceError(
-            f"the device on {self._port} answers {seen}: {f'probably {name}, ' if name else ''}not a CAN232, "
-            f"so it is not used; `firmware: can232` in section adapter takes it for one all the same"
-        )
+    def _close_unanswered(self, profile: Profile) -> Steps:  # noqa: ARG002
+        """That V is answered shows that it has come as far as that."""
+        yield self._step(b"C\r", "close the channel", (NONE,), ())
+        yield self.sync._replace(accept=ANYTHING, reject=())
 
     # --- settings -----------------------------------------------------------------------------
 
-    def _configure(self) -> Steps:
+    def _set(self, profile: Profile, request: bytes, purpose: str, advice: str = "") -> Exchange:
+        """A command that is answered as all settings of this firmware are."""
+        if profile.answers is None:
+            return self._step(request, purpose, (OK, NONE), (REFUSED,), advice=advice)
+        if not profile.answers:
+            return self._step(request, purpose, (NONE,), ())
+        return self._step(request, purpose, advice=advice)
+
+    def _configure(self, profile: Profile) -> Steps:
         timing = self._channel.timing
-        bitrate = bitrate_command(timing)
-        yield self._step(
+        bitrate = bitrate_command(profile, timing)
+        assert bitrate is not None  # see channel_problem()
+        yield self._set(
+            profile,
             bitrate,
             f"set the bit rate ({bitrate[:-1].decode()}, {timing.description})",
-            advice="this firmware may not have it: give btr0 and btr1",
+            advice="this firmware may not have it" + (": give btr0 and btr1" if profile.registers else ""),
         )
+        if not profile.passes_all:
+            return
         acceptance = self._channel.acceptance
         # Always, also to pass all: the device keeps what the program before us set until power-off.
         code, mask = (acceptance.code, acceptance.mask) if acceptance else (0, 0xFFFFFFFF)
-        yield self._step(f"M{code:08X}\r".encode(), f"set the acceptance code {code:#010x}")
-        yield self._step(f"m{mask:08X}\r".encode(), f"set the acceptance mask {mask:#010x}")
-
-    # --- EEPROM: cells wear out and cannot be read; written only what is not known to be there --------
-
-    def _recall(self, setting: str) -> int | None:
-        serial = self.identity.serial_number
-        return None if serial is None else self._memory.recall(serial, setting)
-
-    def _remember(self, setting: str, value: int) -> None:
-        if self.identity.serial_number is not None:
-            self._memory.remember(self.identity.serial_number, setting, value)
-
-    def _eeprom_differences(self, auto_poll: bool) -> list[tuple[str, int]]:
-        """What must be written. X is known from A, Z from frames that came, W only from what we wrote.
-
-        With X as it left the factory W is taken to be so too: whoever sets one sets the other.
-        """
-        differences = []
-        if not auto_poll and (self.identity.version or "")[1:] >= AUTO_POLL_SINCE:
-            differences.append(("X", 1))
-        if self._stamped or self._recall("Z") == 1:
-            differences.append(("Z", 0))
-        known = self._recall("W")
-        if known is None and not auto_poll:
-            known = 0
-            self._remember("W", known)
-        acceptance = self._channel.acceptance
-        if acceptance is not None and not acceptance.passes_all and known != acceptance.single:
-            differences.append(("W", int(acceptance.single)))
-        return differences
-
-    def _write_eeprom(self, setting: str, value: int) -> Steps:
-        """A firmware that refuses X is polled, one that refuses Z says nothing wrong; a filter must hold."""
-        purpose, effect = EEPROM_PURPOSES[setting]
-        accept = (OK,) if setting == "W" else (OK, REFUSED)
-        reject = tuple(reply for reply in (REFUSED, NONE) if reply not in accept)
-        request = f"{setting}{value}"
-        answer = yield self._step(f"{request}\r".encode(), f"{purpose} ({request})", accept, reject)
-        if answer.reply is OK:
-            log.info("stored '%s' (%s) in the adapter's EEPROM: %s", EEPROM_NAMES[request], request, effect)
-            self._remember(setting, value)
-        self._stamped = self._stamped and setting != "Z"
+        yield self._set(profile, f"M{code:08X}\r".encode(), f"set the acceptance code {code:#010x}")
+        yield self._set(profile, f"m{mask:08X}\r".encode(), f"set the acceptance mask {mask:#010x}")
 
     # --- channel ------------------------------------------------------------------------------
 
-    def _open(self) -> Steps:
-        if self._channel.listen_only:
-            step = self._step(b"L\r", "open the channel in listen-only mode (L)")
-        else:
-            step = self._step(b"O\r", "open the channel (O)")
-        yield step._replace(opens=True)
+    def _open(self, profile: Profile) -> Steps:
+        commands = profile.listen_only if self._channel.listen_only else profile.open
+        assert commands is not None  # see channel_problem()
+        *before, last = commands
+        for command in before:
+            yield self._command(profile, command)
+        answer = yield self._command(profile, last)._replace(opens=True)
+        if answer.reply is NONE:
+            self.sending = self.sending._replace(confirms=Confirms.NOTHING)  # nor will it answer a frame
+            yield self.sync
+
+    def _command(self, profile: Profile, command: Command) -> Exchange:
+        step = self._set(profile, f"{command.text}\r".encode(), f"{command.purpose} ({command.text})")
+        return step._replace(accept=(OK, REFUSED), reject=(NONE,)) if command.may_be_refused else step
+
+    # --- a CAN232's EEPROM --------------------------------------------------------------------
+
+    def _mend_eeprom(self, profile: Profile) -> Steps:
+        auto_poll = yield from self._auto_poll()
+        differences = self._eeprom.differences(self._channel.acceptance, auto_poll)
+        if differences:
+            yield from self._close(profile)
+            for setting, value in differences:
+                yield from self._eeprom.write(setting, value)
+            yield from self._open(profile)
+            auto_poll = auto_poll or (yield from self._auto_poll())
+        if not auto_poll:
+            log.info("firmware without auto poll: asking for frames with A every %g s", POLL_INTERVAL_S)
+            self.polling = Polling(b"A\r", b"A", POLL_INTERVAL_S)
 
     def _auto_poll(self) -> Generator[Exchange, Answer, bool]:
         """Whether frames come by themselves: then A is refused (manual 2.0, A). X cannot be read."""
@@ -492,46 +392,44 @@ class Can232:
     # --- health -------------------------------------------------------------------------------
 
     def health_questions(self) -> tuple[Exchange, ...]:
-        return (self._flags_step,)
+        if self.profile is None or self.profile.flags:
+            return (self._step(b"F\r", "tell its status flags", (TEXT, REFUSED, NONE), (), prefix=b"F"),)
+        return (self.sync._replace(accept=(TEXT, REFUSED, NONE), reject=()),)
 
     def read_health(self, answers: Sequence[Answer | None]) -> Observation | None:
         (answer,) = answers
-        if answer is not None and answer.reply is REFUSED:
-            raise AdapterError("the adapter's channel is closed: it was reset, or lost its power")
-        return None if answer is None else _read_flags(answer.text)
+        if answer is None:
+            return None
+        if self.profile is None or self.profile.flags:
+            if answer.reply is REFUSED:
+                raise AdapterError("the adapter's channel is closed: it was reset, or lost its power")
+            return _read_flags(answer.text, self.profile.bus_off_flag if self.profile else None)
+        if answer.reply is REFUSED:
+            return LOCKED
+        return ANSWERS if answer.reply is TEXT else UNKNOWN
 
     def saw_time_stamps(self) -> None:
-        if self._stamped:
-            return
-        self._stamped = True
-        self._remember("Z", 1)
-        log.warning("adapter sends time stamps (Z1), a sixth of its line; switched off at the next start")
+        if self.profile is None or self.profile.polls:
+            self._eeprom.saw_time_stamps()
 
     def saw_noise(self, noise: bytes) -> None:  # noqa: ARG002
-        self._noise = True
+        self._recognition.saw_noise()
 
     def saw_text(self, text: bytes) -> None:
-        self._heard = [*self._heard[1 - HEARD_KEPT :], text]
+        self._recognition.saw_text(text)
 
     def read_report(self, text: bytes) -> Observation | None:  # noqa: ARG002 - it never speaks unasked
         return None
 
 
-def _name_of(answer: bytes, names: Mapping[bytes, str]) -> str | None:
-    return next((name for pattern, name in names.items() if re.fullmatch(pattern, answer)), None)
-
-
-def _shown(answer: bytes) -> str:
-    text = printable(answer.decode("ascii", "replace"))
-    return f"'{text}'" if len(text) <= LONGEST_SHOWN else f"'{text[:LONGEST_SHOWN]}…'"
-
-
 @functools.lru_cache(maxsize=16)
-def _read_flags(answer: bytes) -> Observation:
+def _read_flags(answer: bytes, bus_off_flag: int | None) -> Observation:
     """`F` and two hex digits. Reading clears the flags: they say what happened since, not what is."""
     if not re.fullmatch(b"F[0-9A-Fa-f]{2}", answer):
         return UNKNOWN
     flags = int(answer[1:], 16)
+    if bus_off_flag is not None and flags >> bus_off_flag & 1:
+        return Observation("bus-off", BusState.BUS_OFF)
     happened = Happened.NOTHING
     for bit, what in HAPPENED.items():
         if flags >> bit & 1:

@@ -168,6 +168,10 @@ class Usb2can:
 
     codec = "usb2can"
     sending = Sending()
+    sent_means = "sent means taken by the adapter, by what it answers about the level of its buffer"
+    cautions: tuple[str, ...] = ()
+    tells_full = True
+    stops = True
     baudrate = 115_200  # of no meaning to a FT245, but a tty wants one
     answer_timeout_s = ANSWER_TIMEOUT_S
     polling: Polling | None = None

@@ -245,7 +245,7 @@ class Bridge:
         counters: dict[str, Any] = self._loop.relay.counters()
         settle(counters, lost)
         queued = counters.pop("queued")
-        health, identity = self._polling.health, self.adapter.identity
+        health, adapter = self._polling.health, self.adapter
         counted = {
             "rx_frames": counters.pop("rx_frames"),
             "tx_frames": counters.pop("tx_frames"),
@@ -257,7 +257,7 @@ class Bridge:
             "bus_off_restarts": health.restarts,
             **health.happened,
             **self._interface.error_frames(),
-            "tx_discarded": self.adapter.discarded,
+            "tx_discarded": adapter.discarded,
             **counters,
         }
         state, reason, _ = self.condition()
@@ -265,13 +265,14 @@ class Bridge:
             "name": self.config.name,
             "state": state.value,
             "reason": reason,
-            "channel_open": self._exchanges.channel_open,
+            # One that closing does not take off its bus is on it from the first moment.
+            "channel_open": self._exchanges.channel_open if adapter.stops else True,
             **self._polling.snapshot(),
             "adapter": {
                 "type": self.config.adapter.type,
                 "port": self.config.adapter.port,
-                "version": identity.version,
-                "serial_number": identity.serial_number,
+                **adapter.identity._asdict(),
+                "sent_means": adapter.sent_means,
             },
             "bus": self._interface.snapshot(),
             "counters": self._history.total(counted),
@@ -377,7 +378,7 @@ class Bridge:
         self._port.adapter_runs()
         self._loop.open_gates(self.adapter, listen_only=self.config.channel.listen_only)
         finding = self._polling.start(time.monotonic(), restarted=self._life.is_restart)
-        self._history.adapter_runs(self.adapter.identity)
+        self._history.adapter_runs(self.adapter)
         return finding
 
     def _close_channel(self) -> Found:

@@ -73,6 +73,8 @@ class RelayLoop:
         if adapter.polling is not None:
             polling = adapter.polling
             self.relay.set_polling(polling.request, polling.prefix, polling.interval_s)
+        sync = adapter.sync
+        self.relay.set_sync(sync.request, sync.prefix)
         set_sending(self.relay, adapter.sending)
         if adapter.flow is not None:
             flow = adapter.flow

@@ -22,10 +22,9 @@ STUCK_LEAST_S = 0.5  # a slow, busy CAN bus is no reason
 UNANSWERED_LOG_S = 10.0
 REFUSING_S, REFUSING_LONGEST_S = 60.0, 3600.0
 
-REOPENED = (
-    "; the channel is closed and opened anew, which throws away what is in the adapter's buffer, "
-    "so that nothing is sent late"
-)
+REOPENED = "; the channel is closed and opened anew"
+EMPTIED = ", which throws away what is in the adapter's buffer, so that nothing is sent late"
+KEPT = ", which leaves what is in the adapter's buffer: that may be sent late; unplug it to prevent that"
 
 
 def stuck_s(config: Config) -> float:
@@ -59,7 +58,7 @@ class Recovery:
         """The adapter is bus-off, or cannot tell whether it is."""
         restart = self._config.channel.restart
         if isinstance(restart, After):
-            return Verdict(Event.SILENT, f"{cause}{REOPENED}", restart.seconds, off_bus=True)
+            return Verdict(Event.SILENT, f"{cause}{self._reopened()}", restart.seconds, off_bus=True)
         if restart is Restart.ITSELF:
             return None
         interface = self._config.bus
@@ -68,6 +67,9 @@ class Recovery:
             how = f"ip link set {interface.channel} down, then up,"
         reason = f"{cause}; channel.restart is never: {how} puts it on the bus again"
         return Verdict(Event.BUS_OFF, reason, off_bus=True)
+
+    def _reopened(self) -> str:
+        return REOPENED + (KEPT if self._adapter.sending.keeps_buffer else EMPTIED)
 
     def stuck(self, frames: int, polling: HealthPolling) -> Verdict | None:
         """The adapter has taken no frame for stuck_s(), or none has left it.
@@ -80,9 +82,9 @@ class Recovery:
         cause = f"no frame has left the adapter for {limit_s:g} s"
         if self._adapter.flow is not None:
             why = "does another node acknowledge them? Is it in listen-only mode, or the bus always busy?"
-            reason = f"{cause}, {frames} are in its buffer ({why}){REOPENED}"
+            reason = f"{cause}, {frames} are in its buffer ({why}){self._reopened()}"
             return Verdict(Event.SILENT, reason, pause_s)
-        if polling.was_full(limit_s):  # it cannot tell bus-off
+        if polling.was_full(limit_s) or not self._adapter.tells_full:  # it cannot tell bus-off
             return self.bus_off(
                 f"{cause} (does another node acknowledge them?), its status: {polling.health.description}"
             )

@@ -11,7 +11,7 @@ from bridged.interfaces.base import LOST_BEFORE_READ
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from bridged.adapters.base import Identity
+    from bridged.adapters.base import Adapter, Identity
 
 log = logging.getLogger(__name__)
 
@@ -30,11 +30,19 @@ class History:
         self._counted_before = counters
         self._began_at = before._began_at
 
-    def adapter_runs(self, identity: Identity) -> None:
+    def adapter_runs(self, adapter: Adapter) -> None:
+        """Tells once who it is, and what it cannot promise."""
         self.starts += 1
+        identity = adapter.identity
         if identity != self._identity:
             self._identity = identity
-            log.info("adapter version=%s serial_number=%s", identity.version, identity.serial_number)
+            firmware = f" firmware={identity.firmware}" if identity.firmware else ""
+            log.info(
+                "adapter version=%s serial_number=%s%s", identity.version, identity.serial_number, firmware
+            )
+            log.info("%s", adapter.sent_means)
+            for caution in adapter.cautions:
+                log.warning("of this adapter: %s", caution)
 
     def total(self, counters: dict[str, Any]) -> dict[str, Any]:
         """With those of the bridges before."""

@@ -43,6 +43,8 @@ def _headline(status: dict[str, Any]) -> str:
 def _lines(status: dict[str, Any]) -> list[str]:
     adapter, counters, bus, rates = status["adapter"], status["counters"], status["bus"], status["rates"]
     identity = f"version {adapter['version'] or '?'}, serial number {adapter['serial_number'] or '?'}"
+    if adapter["firmware"]:
+        identity += f", firmware {adapter['firmware']}"
     parts = {
         "adapter": f"{adapter['type']} on {adapter['port']}, {identity}",
         "CAN bus": _bus_state(status),
@@ -59,6 +61,8 @@ def _lines(status: dict[str, Any]) -> list[str]:
         "tx dropped": _reasons(counters["tx_dropped"]) or "none",
         "can-bridge": f"version {status['version']}",
     }
+    if adapter["sent_means"]:
+        parts["sent means"] = adapter["sent_means"].removeprefix("sent means ")
     if status["reason"]:
         parts = {"reason": status["reason"], **parts}
     return [_headline(status), *(f"  {name:<10}  {text}" for name, text in parts.items())]

@@ -208,6 +208,12 @@ uint32_t line_find(struct line *l, const struct codec_message *text)
     return i;
 }
 
+/* What answers it may be known only once the device has said who it is. */
+void line_set_sync(struct line *l, const struct command *sync)
+{
+    l->sync = *sync;
+}
+
 /* The only command that does not wait for room in the window, so it looks for room in `out` itself. */
 static int send_sync(struct line *l, int64_t now)
 {

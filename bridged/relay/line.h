@@ -73,6 +73,7 @@ void line_finish(struct line *l, int64_t now);
 
 struct inflight line_take(struct line *l);
 uint32_t line_find(struct line *l, const struct codec_message *text);
+void line_set_sync(struct line *l, const struct command *sync);
 int line_resync(struct line *l, int64_t now);
 int line_sync_again(struct line *l, int64_t now);
 void line_synced(struct line *l);

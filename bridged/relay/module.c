@@ -326,6 +326,21 @@ static PyObject *Relay_set_queue(PyObject *self, PyObject *args)
     Py_RETURN_NONE;
 }
 
+static PyObject *Relay_set_sync(PyObject *self, PyObject *args)
+{
+    struct command c;
+    Py_buffer data, prefix;
+    if (!PyArg_ParseTuple(args, "y*y*:set_sync", &data, &prefix))
+        return NULL;
+    int result = command_init(&c, &data, 0, &prefix);
+    PyBuffer_Release(&data);
+    PyBuffer_Release(&prefix);
+    if (result < 0)
+        return NULL;
+    relay_set_sync(self_relay(self), &c);
+    Py_RETURN_NONE;
+}
+
 static PyObject *Relay_set_polling(PyObject *self, PyObject *args)
 {
     struct command c;
@@ -509,6 +524,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"hold_interface", Relay_hold_interface, METH_O, NULL},
     {"set_gates", (PyCFunction)(void (*)(void))Relay_set_gates, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_queue", Relay_set_queue, METH_VARARGS, NULL},
+    {"set_sync", Relay_set_sync, METH_VARARGS, NULL},
     {"set_polling", Relay_set_polling, METH_VARARGS, NULL},
     {"set_sending", (PyCFunction)(void (*)(void))Relay_set_sending, METH_VARARGS | METH_KEYWORDS, NULL},
     {"set_level_window", (PyCFunction)(void (*)(void))Relay_set_level_window, METH_VARARGS | METH_KEYWORDS, NULL},

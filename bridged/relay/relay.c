@@ -293,6 +293,13 @@ int relay_set_queue(struct relay *r, const struct queue_settings *set)
     return error;
 }
 
+void relay_set_sync(struct relay *r, const struct command *sync)
+{
+    lock(r);
+    line_set_sync(&r->line, sync);
+    unlock_wake(r);
+}
+
 void relay_set_polling(struct relay *r, const struct command *poll, int64_t interval_ns)
 {
     lock(r);

@@ -45,6 +45,7 @@ void relay_hold_interface(struct relay *r, bool held);
 
 void relay_set_gates(struct relay *r, bool receiving, enum gate gate);
 int relay_set_queue(struct relay *r, const struct queue_settings *set); /* -> 0 or ENOMEM */
+void relay_set_sync(struct relay *r, const struct command *sync);
 void relay_set_polling(struct relay *r, const struct command *poll, int64_t interval_ns);
 void relay_set_sending(struct relay *r, const struct sending_settings *set);
 void relay_set_level_window(struct relay *r, const struct level_settings *set);

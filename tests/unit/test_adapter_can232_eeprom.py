@@ -38,8 +38,8 @@ def test_check_tells_before(
     )
     assert cli.main(["check", str(file)]) == 0
     _, *notes = capsys.readouterr().out.splitlines()
-    assert notes[0] == f"  may store in the adapter's EEPROM, each only if it is not so already: {names}"
-    clones = "  a clone that is recognised is refused at start, unless adapter.firmware is can232"
+    assert notes[0] == f"  may store in a CAN232's EEPROM, each only if it is not so already: {names}"
+    clones = "  unknown firmware is refused at start, unless adapter.firmware says what it is"
     assert notes[1:] == ([] if firmware else [clones])
 
 

@@ -80,6 +80,8 @@ def test_frames_both_ways_and_closed_at_the_end(bench: Bench) -> None:
         "port": "",
         "version": "V1324",
         "serial_number": "A123",
+        "firmware": "can232",
+        "sent_means": bridge.adapter.sent_means,
     }
 
 
@@ -371,6 +373,8 @@ def test_the_plug_is_pulled_in_the_moment_that_ends_a_state(bench: Bench, last: 
                 break
             if line == last:
                 closing = 1  # no answer: it gives up, and closes
+            elif line in {b"v\r", b"F\r"} and closing == 0:
+                port.far.send(b"\a")
             elif closing < 3:
                 port.far.send(b"V1324\r" if b"V" in line else b"NA123\r" if b"N" in line else b"\r")
             else:

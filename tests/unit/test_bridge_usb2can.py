@@ -86,6 +86,8 @@ def test_frames_both_ways_are_exact_and_it_is_closed_at_the_end(bench: Usb2canBe
         "port": "",
         "version": version,
         "serial_number": None,
+        "firmware": None,
+        "sent_means": "sent means taken by the adapter, by what it answers about the level of its buffer",
     }
 
 

@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridged import can
-from bridged.adapters.can232 import BITRATE_COMMANDS, bitrate_command
+from bridged.adapters import firmware
+from bridged.adapters.can232 import bitrate_command
+from bridged.adapters.firmware.profile import BITRATES
 from bridged.simulators import sja1000
 
 with warnings.catch_warnings(action="ignore"):  # python-can 4.1 on Python 3.11
@@ -153,7 +155,7 @@ def test_registers_mean_what_the_data_sheet_says(btr0: int, btr1: int) -> None:
     ],
 )
 def test_can232_command(timing: can.BitTiming, command: bytes, description: str) -> None:
-    assert bitrate_command(timing) == command
+    assert bitrate_command(firmware.load("can232"), timing) == command
     assert timing.description == description
 
 
@@ -180,7 +182,7 @@ def test_registers_of_a_standard_bitrate(bitrate: int, registers: tuple[int, int
 
 
 def test_every_standard_bitrate_has_registers() -> None:
-    assert can.STANDARD_REGISTERS.keys() == BITRATE_COMMANDS.keys()
+    assert can.STANDARD_REGISTERS.keys() == BITRATES.keys()
 
 
 @pytest.mark.parametrize("registers", [(0x03, 0x1C), (0x43, 0x1C), (0, 0x14)])

@@ -115,8 +115,7 @@ def test_no_circle() -> None:
 DOZEN = 12
 # Classes that hold more, and why. An entry may shrink, and goes when its class has become small enough.
 LARGE = {
-    "adapters.can232.Can232": 16,  # what the commands of one family have told of the device
-    "adapters.usb2can.Usb2can": 14,  # the same
+    "adapters.usb2can.Usb2can": 14,  # what the commands of one family have told of the device
     "simulators.can232.Can232": 15,  # the registers of a device
     "simulators.usb2can_firmware.Firmware": 19,  # the same
     "simulators.slcan.Slcan": 21,  # the same

@@ -12,7 +12,7 @@ import pytest
 from benches.bridge import FRAME, Bench, Usb2canBench, run_until, started, stopped
 from benches.simulating import until
 
-from bridged.adapters.base import Steps
+from bridged.adapters.base import Sending, Steps
 from bridged.bridge import lifecycle
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import Event, State, Verdict
@@ -291,12 +291,20 @@ def test_a_stop_does_not_wait_for_an_error_passive_adapter(
         (Restart.NEVER, (Event.BUS_OFF, None, True)),
     ],
 )
-def test_what_bus_off_leads_to(restart: Restart | After, verdict: tuple[object, ...] | None) -> None:
+@pytest.mark.parametrize("keeps_buffer", [False, True])
+def test_what_bus_off_leads_to(
+    restart: Restart | After, verdict: tuple[object, ...] | None, keeps_buffer: bool
+) -> None:
     bus = SimpleNamespace(interface="socketcan", channel="vcan0")
     config: Any = SimpleNamespace(channel=SimpleNamespace(restart=restart), bus=bus)
-    found = Recovery(config, cast("Any", None)).bus_off("bus-off")
+    adapter: Any = SimpleNamespace(sending=Sending(keeps_buffer=keeps_buffer))
+    found = Recovery(config, adapter).bus_off("bus-off")
     assert (found and (found.event, found.pause_s, found.off_bus)) == verdict
     assert found is None or found.reason.startswith("bus-off; ")
+    if isinstance(restart, After):
+        assert found is not None
+        assert ("so that nothing is sent late" in found.reason) != keeps_buffer
+        assert ("that may be sent late" in found.reason) == keeps_buffer
 
 
 def test_frames_that_were_thrown_away_are_in_the_log(caplog: pytest.LogCaptureFixture) -> None:

@@ -166,3 +166,16 @@ def test_time_stamps_as_the_device_has_them(rig: Rig, line: bytes, digits: int, 
         understood = long_stamps or not longer
         assert len(rig.frames()) == understood
     assert rig.counters()["skipped_messages"] == longer
+
+
+def test_the_sync_command_of_a_device_that_has_said_who_it_is(rig: Rig) -> None:
+    rig.relay.set_sync(b"V\r", b"WeAc")
+    rig.bus.send(can_frame(0))
+    rig.turn()
+    rig.turn(301)  # no answer
+    assert rig.said()[1:] == [b"V"]
+    rig.port.send(b"WeAct Studio\r")
+    rig.bus.send(can_frame(1))
+    rig.turn()
+    assert len(rig.said()) == 1
+    assert rig.counters()["resyncs"] == 1

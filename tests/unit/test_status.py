@@ -209,7 +209,7 @@ class TestText:
         counters = snapshot()["counters"] | {"tx_dropped": {"queue-full": 3, "stale": 0}}
         assert render(snapshot(counters=counters, uptime_s=7500)).splitlines() == [
             "can232: running, up 2 h 5 min",
-            "  adapter     can232 on /dev/ttyUSB0, version V1010, serial number A123",
+            "  adapter     can232 on /dev/ttyUSB0, version V1010, serial number A123, firmware can232",
             "  CAN bus     error-active, TEC 0, REC 3, answers in 0.6 ms",
             "  interface   socketcan vcan0",
             "  received    20 frames from the adapter, 10/s, 0 line errors, 0 adapter overruns",
@@ -217,12 +217,16 @@ class TestText:
             "  sent        84 frames to the adapter, 42/s, 1 retries, 0 queued",
             "  tx dropped  queue-full 3",
             "  can-bridge  version 1.2.3",
+            "  sent means  taken",
         ]
 
     def test_what_the_adapter_does_not_vouch_for_is_named_apart(self) -> None:
         counters = snapshot()["counters"] | {"tx_frames": 1, "tx_queued": 7, "tx_unconfirmed": 2}
         text = render(snapshot(counters=counters))
         assert "  sent        1 frames, 7 queued, 2 unconfirmed to the adapter, 42/s," in text
+        assert "sent means" in text
+        adapter = snapshot()["adapter"] | {"sent_means": None}
+        assert "sent means" not in render(snapshot(adapter=adapter))
 
     def test_what_is_not_known(self) -> None:
         bus = snapshot()["bus"] | {"open": False}
@@ -235,7 +239,7 @@ class TestText:
     def test_a_device_does_not_move_the_cursor(self) -> None:
         adapter = snapshot()["adapter"] | {"serial_number": "A\x1b[2J\nroot: running"}
         (line,) = [line for line in render(snapshot(adapter=adapter)).splitlines() if "serial" in line]
-        assert line.endswith(r"serial number A\x1b[2J\nroot: running")
+        assert r"serial number A\x1b[2J\nroot: running, firmware" in line
 
     @pytest.mark.parametrize("part", ["adapter", "rates", "uptime_s", "version"])
     def test_one_of_another_version(self, part: str) -> None:

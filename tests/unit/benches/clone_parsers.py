@@ -296,6 +296,8 @@ class Weact(Strict):
                 return CR
             case b"S":
                 return CR
+            case b"A" | b"M" if rest in {b"0", b"1"} and not self.is_open:
+                return CR
         return BELL
 
 
