@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bridged.interfaces.base import OpenInterface
+    from bridged.ports import Port
     from bridged.settings import BusConfig, Config
 
 EX_CONFIG = 78  # sysexits.h
@@ -31,6 +32,7 @@ PROBES = ("started", "ready", "live")  # see daemon/probes.py
 CONFIG_DIRECTORY = Path("/etc/can-bridge")
 DEFAULT_NAME = "can-bridge"  # of a configuration
 HELP_WIDTH = 98
+MEGABYTES_MAX = 10_000  # of a capture
 OUTPUT_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 CANNOT_WRITE = "cannot write to the standard output: {}"
 
@@ -114,6 +116,7 @@ def _run(args: argparse.Namespace) -> int:
 
     mounted = MountedConfig(config_path(args.config))
     config = _load(args.config)
+    port_opener = _port_opener(args, config)
     open_interface = _opened_as(args.user, config.bus) if args.user else open_interface
     notifier = systemd_notifier()
     fields = start_logging(config.name, verbose=args.verbose)
@@ -123,16 +126,19 @@ def _run(args: argparse.Namespace) -> int:
         "can-bridge %s: %s: %s on %s to %s %s",
         VERSION, _source(config.path), adapter.type, adapter.port, bus.interface, bus.channel,
     )  # fmt: skip
+    if args.capture:
+        masked = ", with other identifiers and without data" if args.mask else ""
+        log.info("capture: all bytes from and to the adapter are written to %s%s", args.capture, masked)
     memory = FileMemory(state_directory())
 
     def successor(present: Config) -> Bridge | None:
         fresh = _load(args.config)
-        return None if fresh == present else Bridge(fresh, memory)
+        return None if fresh == present else Bridge(fresh, memory, open_port=port_opener(fresh))
 
     def snapshot() -> dict[str, Any]:
         return {"version": VERSION, **service.bridge.snapshot()}  # of the present one
 
-    first = Bridge(config, memory, open_interface=open_interface)
+    first = Bridge(config, memory, open_port=port_opener(config), open_interface=open_interface)
     service = Service(first, notifier, successor if hangup_means_reload() else None, mounted)
     fields.state = lambda: service.bridge.state.value
     status = StatusServer(args.socket or own_socket_path(config.name), snapshot)
@@ -145,6 +151,20 @@ def _run(args: argparse.Namespace) -> int:
         status.close()
     log.info("%s", farewell(snapshot()))
     return 0
+
+
+def _port_opener(args: argparse.Namespace, config: Config) -> Callable[[Config], Callable[[str, int], Port]]:
+    """How a bridge opens its ports, by its configuration: with --capture all that goes through is written."""
+    if args.capture:
+        from bridged.capture import LIMIT_MB, MB, Capture  # noqa: PLC0415 - only where it is asked for
+
+        limit = (args.capture_limit or LIMIT_MB) * MB
+        return Capture(args.capture, config, masked=args.mask, limit=limit).opener
+    if args.mask or args.capture_limit:
+        raise BridgeError("--mask and --capture-limit are for --capture FILE, which is not there")
+    from bridged.ports import open_port  # noqa: PLC0415 - 20 ms that `status` need not pay
+
+    return lambda _: open_port
 
 
 def _opened_as(user: str, bus: BusConfig) -> Callable[..., OpenInterface]:
@@ -373,6 +393,13 @@ def _complain(text: str) -> None:
     print(f"can-bridge: {printable(text)}", file=sys.stderr)
 
 
+def _megabytes(text: str) -> int:
+    """An option's value."""
+    if text.isdecimal() and 0 < int(text) <= MEGABYTES_MAX:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {MEGABYTES_MAX}, got {text!r}")
+
+
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     """The parser; only the command, and the simulator, that is named gets its options: they cost imports."""
     command = arguments[0] if arguments else None
@@ -415,6 +442,23 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         "privilege (for a container that starts as root)",
     )
     run.add_argument("--verbose", action="store_true", help="log details (debugging)")
+    run.add_argument(
+        "--capture",
+        type=Path,
+        metavar="FILE",
+        help="for bug reports: all bytes from and to the adapter are written to this new file, as text",
+    )
+    run.add_argument(
+        "--mask",
+        action="store_true",
+        help="with --capture: identifiers become others, the same always the same, and data becomes zeros",
+    )
+    run.add_argument(
+        "--capture-limit",
+        type=_megabytes,
+        metavar="MB",
+        help="the capture ends when its file has so many megabytes; default: 16",
+    )
 
     interface = add(
         "interface",

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import socket
+import stat
 import struct
 from pathlib import Path
 from typing import Final
@@ -108,7 +109,10 @@ class Watch:
     def opened(self, fd: int) -> None:
         """The port was opened as `fd`: a numbered terminal is known by it from now on."""
         if self._name.is_numbered_terminal and self._terminal is None:
-            self._terminal = _identity(os.fstat(fd))
+            status = os.fstat(fd)
+            if not stat.S_ISCHR(status.st_mode):  # something is between the terminal and its user
+                status = os.stat(self._port)  # noqa: PTH116 - as above
+            self._terminal = _identity(status)
 
     def refuse_stranger(self) -> None:
         """PortError if /dev/pts/N is not the terminal any more that was opened first.

@@ -23,6 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     "cli": {
         "adapters",
         "bridge",
+        "capture",
         "config",
         "daemon",
         "demo",
@@ -32,6 +33,7 @@ ALLOWED: dict[str, set[str]] = {
         "settings",
         "simulators",
     },
+    "capture": {"adapters", "ports", "settings"},
     "demo": {"bridge", "config", "daemon", "interfaces", "simulators"},
     "daemon": {"bridge", "config", "settings"},
     "bridge": {"adapters", "can", "interfaces", "ports", "settings", "_relay"},
