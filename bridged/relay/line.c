@@ -18,7 +18,9 @@ void line_set(struct line *l, const struct sending_settings *set)
     l->encode = l->codec->encode[set->remote];
     l->unconfirmed = each && set->answer == ANSWER_NONE;
     l->answered = each && !l->unconfirmed;
-    l->window = l->unconfirmed ? WINDOW_MAX : set->window ? set->window : l->usual_window;
+    l->overtaking = each && set->answer == ANSWER_SENT;
+    l->frames_max = l->unconfirmed ? WINDOW_MAX : set->window ? set->window : l->usual_window;
+    l->window = l->frames_max + l->overtaking;
 }
 
 static void set_usual(struct line *l)
@@ -193,6 +195,24 @@ struct inflight line_take(struct line *l)
     l->inflight_head = (l->inflight_head + 1) % INFLIGHT_MAX;
     l->inflight_count--;
     return oldest;
+}
+
+/* Makes the i-th oldest in flight the oldest. */
+void line_bring_forward(struct line *l, uint32_t i)
+{
+    struct inflight moved = *line_at(l, i);
+    for (; i; i--)
+        l->inflight[(l->inflight_head + i) % INFLIGHT_MAX] = *line_at(l, i - 1);
+    l->inflight[l->inflight_head] = moved;
+}
+
+/* The oldest frame in flight; inflight_count if there is none. */
+uint32_t line_find_frame(const struct line *l)
+{
+    uint32_t i = 0;
+    while (i < l->inflight_count && line_at(l, i)->kind != INFLIGHT_FRAME)
+        i++;
+    return i;
 }
 
 /* Which in flight this text answers: the oldest that asked for it; inflight_count if none. */

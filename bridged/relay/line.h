@@ -44,6 +44,8 @@ struct line {
     int64_t answer_timeout_ns;
     size_t (*encode)(const struct can_frame *frame, uint8_t *out);
     uint32_t window, usual_window;
+    uint32_t frames_max; /* of `window`; with `overtaking` a command has a place besides */
+    bool overtaking;    /* a frame is answered when it is on the bus; commands are answered at once, before it */
     bool answered;      /* a frame is in flight until the device answers it */
     bool unconfirmed;   /* the device never tells of a frame */
     uint32_t unwritten; /* with `unconfirmed`: frames in `out` */
@@ -72,6 +74,8 @@ int line_flush(struct line *l, int port);
 void line_finish(struct line *l, int64_t now);
 
 struct inflight line_take(struct line *l);
+void line_bring_forward(struct line *l, uint32_t i);
+uint32_t line_find_frame(const struct line *l);
 uint32_t line_find(struct line *l, const struct codec_message *text);
 void line_set_sync(struct line *l, const struct command *sync);
 int line_resync(struct line *l, int64_t now);

@@ -89,8 +89,11 @@ static void answer_text(struct transmit *t, const struct codec_message *msg, int
 {
     uint32_t before = line_find(t->line, msg);
     if (before < t->line->inflight_count) {
-        while (before--)
-            oldest_unanswered(t);
+        if (t->line->overtaking)
+            line_bring_forward(t->line, before);
+        else
+            while (before--)
+                oldest_unanswered(t);
         oldest_answered(t, EVENT_TEXT, msg, now);
         return;
     }
@@ -103,6 +106,8 @@ static void answer_text(struct transmit *t, const struct codec_message *msg, int
 static void answer_short(struct transmit *t, enum codec_kind kind, int64_t now)
 {
     const struct codec_message none = {.kind = kind};
+    if (t->line->overtaking && line_find_frame(t->line) < t->line->inflight_count)
+        line_bring_forward(t->line, line_find_frame(t->line));
     const struct inflight *oldest = t->line->inflight_count ? line_at(t->line, 0) : NULL;
     bool refused = kind == CODEC_REFUSED;
     bool accepted = oldest && oldest->accept & (refused ? ACCEPT_REFUSED : ACCEPT_OK);
@@ -146,6 +151,7 @@ void transmit_reset(struct transmit *t)
         t->command_head = (t->command_head + 1) % COMMANDS_MAX;
     }
     t->polling = t->polled = t->late_answer_possible = false;
+    t->stuck_told_ns = 0;
     t->poll.length = 0;
     line_reset(t->line);
     ack_window_reset(t->ack);
@@ -227,6 +233,54 @@ static bool keeps_its_place(const struct inflight *oldest, bool live)
     return oldest->kind == INFLIGHT_FRAME || (oldest->kind == INFLIGHT_LEVEL && live);
 }
 
+/* When the i-th in flight is overdue, where frames are answered when they are on the bus: such a frame waits for the
+ * bus, until the gate is closed. */
+static int64_t overdue_at(const struct transmit *t, uint32_t i)
+{
+    const struct inflight *in = line_at(t->line, i);
+    if (in->kind != INFLIGHT_FRAME || t->queue->gate != GATE_OPEN)
+        return in->deadline_ns;
+    int64_t sent_ns = in->deadline_ns - t->line->answer_timeout_ns;
+    int64_t since = sent_ns > t->stuck_told_ns ? sent_ns : t->stuck_told_ns;
+    return since + t->queue->set.stuck_ns;
+}
+
+static int64_t overtaking_deadline(const struct transmit *t)
+{
+    int64_t at = t->line->out_until_ns;
+    for (uint32_t i = 0; i < t->line->inflight_count; i++)
+        if (overdue_at(t, i) < at)
+            at = overdue_at(t, i);
+    return at;
+}
+
+/* The channel is being closed: the answer to that must not count for a frame. */
+static void give_up_frames(struct transmit *t)
+{
+    for (uint32_t i; (i = line_find_frame(t->line)) < t->line->inflight_count;) {
+        line_bring_forward(t->line, i);
+        oldest_unanswered(t);
+    }
+}
+
+/* No answer is lost: those to frames come later than those to commands, and not before the bus takes the frame. */
+static void look_for_overdue(struct transmit *t, int64_t now)
+{
+    struct line *l = t->line;
+    for (uint32_t i = 0; i < l->inflight_count; i++) {
+        if (overdue_at(t, i) > now)
+            continue;
+        if (line_at(l, i)->kind == INFLIGHT_FRAME && t->queue->gate == GATE_OPEN) {
+            t->stuck_told_ns = now;
+            events_emit(t->events, EVENT_STUCK, l->inflight_count, NULL, 0);
+            continue;
+        }
+        line_bring_forward(l, i);
+        oldest_unanswered(t);
+        i--;
+    }
+}
+
 /* -> 0, or errno of a port that is gone */
 static int look_for_missing(struct transmit *t, int64_t now)
 {
@@ -241,7 +295,9 @@ static int look_for_missing(struct transmit *t, int64_t now)
         t->late_answer_possible = false;
         return 0;
     }
-    while (l->inflight_count && line_at(l, 0)->deadline_ns <= now) {
+    if (l->overtaking)
+        look_for_overdue(t, now);
+    while (!l->overtaking && l->inflight_count && line_at(l, 0)->deadline_ns <= now) {
         bool kept = keeps_its_place(line_at(l, 0), live);
         if (!kept)
             oldest_unanswered(t);
@@ -258,7 +314,7 @@ static int look_for_missing(struct transmit *t, int64_t now)
 
 static bool frame_ready(const struct transmit *t, int64_t now)
 {
-    if (t->line->silent || !queue_waiting(t->queue))
+    if (t->line->silent || !queue_waiting(t->queue) || t->line->inflight_count >= t->line->frames_max)
         return false;
     if (!pace_open(t->pace, now))
         return false;
@@ -310,6 +366,8 @@ static bool send_next(struct transmit *t, bool receiving, int64_t now)
         return true;
     }
     if (t->command_count) {
+        if (t->line->overtaking && t->queue->gate != GATE_OPEN)
+            give_up_frames(t);
         line_send_command(t->line, &t->commands[t->command_head], INFLIGHT_COMMAND, now);
         t->command_head = (t->command_head + 1) % COMMANDS_MAX;
         t->command_count--;
@@ -362,7 +420,7 @@ int transmit_pump(struct transmit *t, int port, bool receiving, int64_t now)
 int64_t transmit_deadline(const struct transmit *t, bool receiving)
 {
     const struct line *l = t->line;
-    int64_t at = line_deadline(l);
+    int64_t at = l->overtaking && !l->resyncing ? overtaking_deadline(t) : line_deadline(l);
     if (l->silent || t->ack->checking || l->out_start || !line_has_room(l) || !line_window_open(l))
         return at;
     if (t->poll.length && receiving && !t->polling && t->poll_at_ns < at)

@@ -24,6 +24,7 @@ struct transmit {
     uint64_t poll_decoded; /* counters.decoded when the last poll was sent */
     bool polling;          /* one is in flight */
     bool polled;           /* since the last frame: a frame goes before the next poll */
+    int64_t stuck_told_ns; /* EVENT_STUCK of a device that answers a frame when it is on the bus; 0: not yet */
     bool late_answer_possible; /* a command timed out; resync before sending the first frame */
 };
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from benches.relay import EFF_FLAG, FRAME, Rig, can_frame
+from benches.relay import EFF_FLAG, FRAME, MS, Rig, can_frame
 
 from bridged import _relay
 from bridged.adapters.base import Confirms, Remote, Sending
@@ -179,3 +179,72 @@ def test_the_sync_command_of_a_device_that_has_said_who_it_is(rig: Rig) -> None:
     rig.turn()
     assert len(rig.said()) == 1
     assert rig.counters()["resyncs"] == 1
+
+
+class TestAnswersThatComeLater:
+    """WeAct: CR when the frame was on the bus, V answered at once; each health question overtakes frames."""
+
+    @pytest.fixture(autouse=True)
+    def _sent(self, rig: Rig) -> None:
+        set_sending(rig.relay, Sending(Confirms.SENT, window=3, retries=False))
+        for number in range(4):
+            rig.bus.send(can_frame(number))
+            rig.turn()
+
+    def ask(self, rig: Rig, token: int) -> None:
+        rig.relay.command(token, b"V\r", 0, b"WeAc", 0.3)
+        rig.turn()
+
+    def test_a_question_goes_though_the_window_is_full_and_costs_no_frame(self, rig: Rig) -> None:
+        self.ask(rig, 7)
+        assert [line[:1] for line in rig.said()] == [b"T", b"t", b"T", b"V"]
+        rig.port.send(b"WeAct Studio\r")
+        rig.turn()
+        assert rig.events() == [(_relay.EVENT_TEXT, 7, b"WeAct Studio")]
+        rig.port.send(b"\r\r\r")
+        rig.turn()
+        rig.port.send(b"\r")
+        rig.turn()
+        counters = rig.counters()
+        assert (counters["tx_frames"], counters["unanswered"], counters["queued"]) == (4, 0, 0)
+
+    def test_an_answer_to_a_frame_is_not_one_to_the_question_before_it(self, rig: Rig) -> None:
+        rig.port.send(b"\r\r\r")
+        rig.turn()
+        rig.port.send(b"\r")
+        rig.turn()
+        self.ask(rig, 7)
+        rig.bus.send(can_frame(4))
+        rig.turn()
+        rig.port.send(b"\r")
+        rig.turn()
+        rig.port.send(b"WeAct Studio\r")
+        rig.turn()
+        assert rig.events() == [(_relay.EVENT_TEXT, 7, b"WeAct Studio")]
+        assert (rig.counters()["tx_frames"], rig.counters()["stray_answers"]) == (5, 0)
+
+    def test_a_bus_that_nobody_acknowledges_loses_no_answer(self, rig: Rig) -> None:
+        """No resynchronisation: the frames are in the device, until Python closes it."""
+        self.ask(rig, 7)
+        due = rig.turn()
+        while due is not None and due <= 4_000 * MS:
+            assert due > rig.now
+            rig.now = due
+            due = rig.turn()
+        kinds = [kind for kind, _, _ in rig.events()]
+        assert kinds == [_relay.EVENT_TIMEOUT] + [_relay.EVENT_STUCK] * 3
+        counters = rig.counters()
+        assert (counters["resyncs"], counters["queued"], counters["stale"]) == (0, 3, 1)
+
+    @pytest.mark.parametrize("ms", [0, 900])
+    def test_the_answer_to_the_closing_counts_for_no_frame(self, rig: Rig, ms: int) -> None:
+        rig.turn(ms)
+        rig.relay.set_gates(receiving=False, transmit=_relay.GATE_AWAY)
+        rig.relay.command(8, b"C\r", _relay.ACCEPT_OK, b"", 0.3)
+        rig.turn()
+        assert rig.said()[-1] == b"C"
+        rig.port.send(b"\r")
+        rig.turn()
+        assert rig.events() == [(_relay.EVENT_OK, 8, b"")]
+        counters = rig.counters()
+        assert (counters["unanswered"], counters["tx_frames"], counters["resyncs"]) == (3, 0, 0)
