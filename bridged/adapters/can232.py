@@ -113,7 +113,7 @@ class Can232Config(AdapterConfig, frozen=True, kw_only=True):
     default_window: ClassVar[int] = 1
     default_restart = After(0.1)
     bitrates = BITRATES.keys()
-    schemes: ClassVar[tuple[str, ...]] = ("socket", "rfc2217")
+    schemes: ClassVar[tuple[str, ...]] = ("socket", "rfc2217", "usb-serial")
     refused_schemes: ClassVar[Mapping[str, str]] = {
         "usb": "usb:// goes with type: usb2can; a CAN232 is on a serial line, such as /dev/ttyUSB0"
     }

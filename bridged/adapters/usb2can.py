@@ -126,7 +126,7 @@ class Usb2canConfig(AdapterConfig, frozen=True, kw_only=True):
     default_restart = Restart.ITSELF
     bitrates = STANDARD_REGISTERS.keys()
     identified_by_usb: ClassVar[bool] = True  # no command tells its serial number
-    schemes: ClassVar[tuple[str, ...]] = ("socket", "usb")
+    schemes: ClassVar[tuple[str, ...]] = ("socket", "usb", "usb-serial")
     refused_schemes: ClassVar[Mapping[str, str]] = {
         "rfc2217": "rfc2217:// sets the baud rate of a serial line, and a USB2CAN has none; write socket://"
     }

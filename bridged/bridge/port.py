@@ -75,7 +75,7 @@ class PortOpener:
             self._watch.refuse_stranger()
             path = self._watch.path()
             if path not in {self.path, self._port}:
-                log.info("%s has the serial number that is wanted, not %s", path, self._port)
+                log.info("%s is opened for %s, by its serial number", path, self._port)
             self.path = path
             self._end(self._open_port(path, baudrate))
         except Exception as error:  # noqa: BLE001 - a bug is raised again in the thread that can end the bridge

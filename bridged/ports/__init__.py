@@ -27,7 +27,7 @@ class Port(Protocol):
 
 
 def open_port(port: str, baudrate: int) -> Port:
-    """Open a tty by its path, a USB device by `usb://VID:PID[/SERIAL]`, or a pyserial URL.
+    """Open a tty by its path or as `usb-serial://SERIAL`, a USB device by `usb://VID:PID[/SERIAL]`, or a URL.
 
     `baudrate` in bit/s; a USB FIFO has none. Raises PortError, with what to do about it.
     """

@@ -12,7 +12,7 @@ from bridged.text import quoted
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-SCHEMES: Final = ("socket", "rfc2217", "usb")
+SCHEMES: Final = ("socket", "rfc2217", "usb", "usb-serial")
 
 _SCHEME_WITHOUT_SLASHES: Final = re.compile(rf"({'|'.join(SCHEMES)}):/?([!-~]+)", re.ASCII)
 
@@ -25,12 +25,15 @@ _ADDRESS: Final = re.compile(
 _USB_DEVICE: Final = re.compile(r"([0-9A-Fa-f]{4}):([0-9A-Fa-f]{4})(?:/([!-~]{1,32}))?")
 """VID:PID or VID:PID/SERIAL: 0403:6001, 0403:6001/A6008isP."""
 
+_SERIAL_NUMBER: Final = re.compile("[!-~]{1,32}")
+
 
 class PortName:
     """The parts of a name; those that it has not, or that do not keep to the grammar, are empty.
 
     `/dev/ttyUSB0` has a `path`, `socket://nas:4001` an `address` (host, TCP port), `usb://0403:6001/A1` a
-    `usb_id` (vendor, product) and perhaps a `serial_number`. `scheme` is whatever stands before `://`.
+    `usb_id` (vendor, product) and perhaps a `serial_number`. `usb-serial://A1` has only that: it is the tty
+    of the USB device with this serial number. `scheme` is whatever stands before `://`.
     """
 
     __slots__ = ("address", "path", "scheme", "serial_number", "text", "usb_id")
@@ -47,6 +50,9 @@ class PortName:
             if device := _USB_DEVICE.fullmatch(rest):
                 self.usb_id = int(device[1], 16), int(device[2], 16)
                 self.serial_number = device[3]
+        elif self.scheme == "usb-serial":
+            if _SERIAL_NUMBER.fullmatch(rest):
+                self.serial_number = rest
         elif separator and (address := _ADDRESS.fullmatch(rest)) and 1 <= int(address[2]) <= 65_535:
             self.address = address[1].strip("[]"), int(address[2])
 
@@ -54,6 +60,11 @@ class PortName:
     def is_numbered_terminal(self) -> bool:
         """Whether it is /dev/pts/N itself, and no link to it: a name that the kernel uses again and again."""
         return re.fullmatch(r"//?dev/pts/\d+", os.path.normpath(self.path)) is not None
+
+    @property
+    def is_tty_of_usb_device(self) -> bool:
+        """Whether it is usb-serial://SERIAL."""
+        return self.scheme == "usb-serial" and self.serial_number is not None
 
     def problem(
         self, schemes: Sequence[str] = SCHEMES, refused: Mapping[str, str] = MappingProxyType({})
@@ -67,12 +78,15 @@ class PortName:
                 return f"a raw TCP port is written {quoted(f'socket://{rest}')}"
             if text := refused.get(self.scheme):
                 return text
-            wanted = " or ".join(f"{name}://" for name in schemes)
+            *most, last = (f"{name}://" for name in schemes)
+            wanted = f"{', '.join(most)} or {last}" if most else last
             return f"the URL of a port begins with {wanted}, not {quoted(f'{self.scheme}://')}"
-        if self.usb_id or self.address:
+        if self.usb_id or self.address or self.is_tty_of_usb_device:
             return None
         if self.scheme == "usb":
             wanted = "usb://VID:PID or usb://VID:PID/SERIAL, VID and PID as 4 hex digits each"
+        elif self.scheme == "usb-serial":
+            wanted = "usb-serial://SERIAL, the serial number of a USB device, without spaces"
         else:
             wanted = f"{self.scheme}://HOST:PORT with a PORT from 1 to 65535"
         return f"expected {wanted}, got {quoted(self.text)}"

@@ -55,11 +55,14 @@ _BACKLOG_MAX: Final = 1_000_000  # bytes of a pumped port that were not read yet
 def open_serial(name: PortName, baudrate: int) -> TtyPort | TcpPort | PumpedPort:
     """Open a path (`/dev/ttyUSB0`, a pty) or a URL (`socket://host:port`, `rfc2217://host:port`), 8N1.
 
+    `usb-serial://SERIAL` is the path of the tty that the USB device with this serial number has now.
     `baudrate` in bit/s; socket:// has none. Raises PortError.
     """
-    port = name.text
     if name.scheme == "socket":
         return TcpPort(name)
+    if name.scheme == "usb-serial":
+        name = PortName(_tty_path(name))
+    port = name.text
     if baudrate <= 0:
         raise PortError(f"{port}: baudrate {baudrate} must be above 0")
     if name.path:
@@ -184,6 +187,27 @@ class PumpedPort(Pump):
 
     def _release(self) -> None:
         self._device.close()
+
+
+def _tty_path(name: PortName) -> str:
+    """The path of the tty that usb-serial://SERIAL means; PortError if there is none, or more than one."""
+    if name.serial_number is None:
+        raise PortError(f"{name.text}: not of the form usb-serial://SERIAL")
+    ttys = sysfs.usb_ttys_of(name.serial_number)
+    devices = {tty.device: tty for tty in reversed(ttys)}  # the first line of each
+    if len(devices) == 1:
+        return str(_DEV / ttys[0].name)
+    if ttys:
+        places = " and ".join(f"{_DEV / tty.name} (USB {device})" for device, tty in sorted(devices.items()))
+        raise PortError(
+            f"{name.text}: {len(devices)} devices have this serial number, {places}: plug in only one, or "
+            "use the path of the one that is meant, as in /dev/serial/by-path"
+        )
+    here = [f"{number} ({_DEV / tty.name})" for tty, number in sysfs.usb_ttys().items() if number]
+    raise PortError(
+        f"{name.text}: no USB device with a serial line has this serial number; those here: "
+        f"{', '.join(here) or 'none'}"
+    )
 
 
 def _refuse_terminal(port: str) -> None:

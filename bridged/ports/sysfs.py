@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from bridged.text import printable
 
@@ -18,6 +18,34 @@ def tty_directory(fd: int) -> Path | None:
     number = os.fstat(fd).st_rdev
     link = _SYS / "dev/char" / f"{os.major(number)}:{os.minor(number)}"
     return link.resolve() if link.exists() else None
+
+
+class UsbTty(NamedTuple):
+    """A serial line of a USB device."""
+
+    device: str  # where the device is plugged in: 3-1.4 is bus 3, ports 1 and 4
+    interface: int  # which line of the device it is
+    name: str  # ttyUSB0
+
+
+def usb_ttys() -> dict[UsbTty, str]:
+    """All that are there, with the serial number of their devices, which some do not have: ""."""
+    found = {}
+    for link in (_SYS / "class/tty").glob("tty[A-Z]*"):
+        directory = link.resolve()
+        device = _usb_device(directory)
+        if device is None:
+            continue
+        inner = directory.relative_to(device).parts[0]  # 1-1:1.0 is configuration 1, interface 0
+        interface = inner.rpartition(".")[2]
+        tty = UsbTty(device.name, int(interface) if interface.isdecimal() else 0, link.name)
+        found[tty] = serial_number(device) or ""
+    return dict(sorted(found.items()))
+
+
+def usb_ttys_of(serial_number: str) -> list[UsbTty]:
+    """Those of the devices with this serial number: one device after the other, its first line first."""
+    return [tty for tty, number in usb_ttys().items() if number == serial_number]
 
 
 def usb_directory(bus: int, ports: tuple[int, ...]) -> Path:
@@ -36,12 +64,16 @@ def product(directory: Path) -> str | None:
 
 
 def _usb_text(directory: Path, name: str) -> str | None:
-    for parent in (directory, *directory.parents):
-        if (parent / "idVendor").exists():  # the device itself; further up are hubs
-            with contextlib.suppress(OSError):
-                return printable((parent / name).read_text(errors="replace").strip()) or None
-            return None
+    device = _usb_device(directory)
+    if device is not None:
+        with contextlib.suppress(OSError):
+            return printable((device / name).read_text(errors="replace").strip()) or None
     return None
+
+
+def _usb_device(directory: Path) -> Path | None:
+    """The directory of the USB device that `directory` belongs to; further up are hubs."""
+    return next((path for path in (directory, *directory.parents) if (path / "idVendor").exists()), None)
 
 
 def latency_ms(tty: Path) -> int | None:

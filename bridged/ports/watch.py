@@ -1,41 +1,41 @@
-"""Tells when the device of a port is plugged in: by the device events of the kernel and of udev."""
+"""Tells when the device of a port is plugged in: by device events, and by names that appear in /dev.
+
+Each finds what the other does not: udev's events tell of permissions and links, but a container with a user
+namespace gets no events at all; and a path need not be one of the kernel's devices.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
-import socket
+import select
 import stat
-import struct
+from collections import deque
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bridged.errors import PortError
 from bridged.ports import sysfs
 from bridged.ports.names import PortName
+from bridged.ports.uevents import Uevents, open_socket
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Iterator
+
+    from bridged.ports.inotify import Inotify
 
 _SYS: Final = Path("/sys")
 _DEV: Final = Path("/dev")
 
-# linux/netlink.h, not in Python's socket module
-_NETLINK_KOBJECT_UEVENT: Final = 15
-_SOL_NETLINK: Final = 270
-_ADD_MEMBERSHIP: Final = 1
-_DROP_MEMBERSHIP: Final = 2
-# The kernel's own events, and udev's, which come when its rules have set permissions and links.
-_GROUPS: Final = (1, 2)
-
-_UDEV_PREFIX: Final = b"libudev\0"
-_UDEV_OFFSET: Final = struct.Struct("=16xI")  # where the properties begin (systemd, device-monitor.c)
-_EVENT_SIZE: Final = 16_384
+_LINKS_MAX: Final = 40  # as the kernel follows
 
 
 class Watch:
-    """Looks out for the device of a port: a path, `usb://VID:PID[/SERIAL]`, or a URL that has none.
+    """Looks out for the device of a port: a path, `usb-serial://SERIAL`, `usb://VID:PID[/SERIAL]`.
 
-    `fd` is readable at device events between arm() and disarm(); it is -1 where there are none (a sandbox
-    without AF_NETLINK): then only is_there() tells.
+    A URL of the network has none. `fd` is readable when something happens between arm() and disarm(); it is
+    -1 where nothing will tell: then only is_there() does.
     """
 
     def __init__(
@@ -47,40 +47,66 @@ class Watch:
         """
         self._port = port
         self._name = PortName(port)
-        self._usb_serial_number = usb_serial_number
+        self._serial_number: str | None = None  # of the USB device whose tty is meant
+        if self._name.path:
+            self._serial_number = usb_serial_number
+        elif self._name.is_tty_of_usb_device:
+            self._serial_number = self._name.serial_number
         self._terminal: tuple[int, int] | None = None  # the numbered one that was opened
-        self._socket = events
-        if events is None and (self._name.usb_id or self._name.path):
-            with contextlib.suppress(OSError):
-                self._socket = socket.socket(
-                    socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, _NETLINK_KOBJECT_UEVENT
-                )
-                self._socket.bind((0, 0))  # or the kernel would take us for itself, and not tell us
-        self.fd = self._socket.fileno() if self._socket else -1
+        self._uevents: Uevents | None = None
+        self._inotify: Inotify | None = None  # between arm() and disarm()
+        self._epoll: select.epoll | None = None
+        if self._name.path or self._name.usb_id or self._name.is_tty_of_usb_device:
+            with contextlib.suppress(OSError):  # no descriptor is left
+                self._epoll = select.epoll()
+        if self._epoll and (events := events or open_socket()):
+            self._uevents = Uevents(events)
+            self._epoll.register(events, select.EPOLLIN)
+        self.fd = self._epoll.fileno() if self._epoll else -1
 
     def arm(self) -> None:
-        self._set_membership(_ADD_MEMBERSHIP)
+        """Before a look: what comes between the two would be missed else."""
+        if self._uevents:
+            self._uevents.listen(True)
+        if self._epoll and self._inotify is None:
+            with contextlib.suppress(OSError):  # other programs of this user have too many of them
+                from bridged.ports.inotify import Inotify  # noqa: PLC0415 - it takes ctypes
+
+                self._inotify = Inotify()
+                self._epoll.register(self._inotify, select.EPOLLIN)
+        self._look_into_directories()
 
     def disarm(self) -> None:
-        self._set_membership(_DROP_MEMBERSHIP)
-        self._read_events()
+        if self._inotify:
+            self._inotify.close()
+            self._inotify = None
+        if self._uevents:
+            self._uevents.listen(False)
+            self._uevents.read()
 
     def close(self) -> None:
         """Idempotent."""
         self.fd = -1
-        if self._socket:
-            self._socket.close()
-            self._socket = None
+        for part in (self._inotify, self._uevents, self._epoll):
+            if part:
+                part.close()
+        self._inotify = self._uevents = self._epoll = None
 
     def has_come(self) -> bool:
         """Read all events; whether our device was plugged in, or may have been."""
-        events, some_lost = self._read_events()
-        return (some_lost or any(self._is_ours(event) for event in events)) and self.is_there()
+        events, some_lost = self._uevents.read() if self._uevents else ([], False)
+        paths, others = self._inotify.read() if self._inotify else (set(), False)
+        if paths or others:
+            self._look_into_directories()
+        perhaps = some_lost or others or any(self._is_ours(event) for event in events)
+        return (perhaps or not paths.isdisjoint(self._steps())) and self.is_there()
 
     def is_there(self) -> bool:
         """Whether there is something to open. True where one cannot know."""
         if self._name.usb_id:
-            return self._has_usb_device(*self._name.usb_id)
+            return not (_SYS / "bus/usb/devices").exists() or any(self._usb_devices())
+        if self._name.is_tty_of_usb_device:
+            return bool(self._ttys())
         if not self._name.path:
             return True
         if self._is_stranger():
@@ -95,16 +121,12 @@ class Watch:
 
     def path(self) -> str:
         """What to open: the port, or the tty that has the serial number if what the port means has not."""
-        if self._usb_serial_number is None or not self._name.path:
+        ttys = self._ttys()
+        if not ttys or Path(self._port).resolve().name in {tty.name for tty in ttys}:
             return self._port
-        ttys = [
-            tty.name
-            for tty in sorted((_SYS / "class/tty").glob("tty[A-Z]*"))
-            if sysfs.serial_number(tty.resolve()) == self._usb_serial_number
-        ]
-        if not ttys or Path(self._port).resolve().name in ttys:
-            return self._port
-        return str(_DEV / ttys[0])
+        if self._name.is_tty_of_usb_device and len({tty.device for tty in ttys}) > 1:
+            return self._port  # opening it says that one cannot know which is meant
+        return str(_DEV / ttys[0].name)
 
     def opened(self, fd: int) -> None:
         """The port was opened as `fd`: a numbered terminal is known by it from now on."""
@@ -143,36 +165,78 @@ class Watch:
         name = Path(event.get("DEVNAME", "")).name  # ttyUSB0 from the kernel, /dev/ttyUSB0 from udev
         return event.get("SUBSYSTEM") == "tty" and name == Path(self.path()).resolve().name
 
-    def _has_usb_device(self, vendor: int, product: int) -> bool:
-        devices = _SYS / "bus/usb/devices"
-        if not devices.exists():
-            return True
-        wanted = (f"{vendor:04x}", f"{product:04x}")
-        for device in devices.iterdir():
+    def _ttys(self) -> list[sysfs.UsbTty]:
+        """The ttys of the USB device with the serial number; none if it does not matter."""
+        return sysfs.usb_ttys_of(self._serial_number) if self._serial_number else []
+
+    def _usb_devices(self) -> Iterator[Path]:
+        """The directories of those that usb://VID:PID/SERIAL may mean."""
+        assert self._name.usb_id
+        wanted = tuple(f"{number:04x}" for number in self._name.usb_id)
+        for device in (_SYS / "bus/usb/devices").glob("*"):
             with contextlib.suppress(OSError):  # an interface, or just unplugged
                 if (_read(device / "idVendor"), _read(device / "idProduct")) != wanted:
                     continue
                 if self._name.serial_number in {None, sysfs.serial_number(device)}:
-                    return True
+                    yield device
+
+    # --- directories --------------------------------------------------------------------------
+
+    def _look_into_directories(self) -> None:
+        """Has inotify tell of what may lead to the device, as far as it exists; more does with each step."""
+        while self._inotify and self._inotify.add(self._directories()):
+            pass  # something may have come in there before: look again
+
+    def _directories(self) -> set[Path]:
+        """Where the next step to the device may appear."""
+        found = {Path(step).parent for step in self._steps() if not _is_directory(step)}
+        if self._serial_number:
+            found.add(_DEV)
+        if self._name.usb_id:
+            found |= {_DEV / "bus/usb", *(_DEV / "bus/usb").glob("[0-9]*")}
+        return found
+
+    def _steps(self) -> set[str]:
+        """All names that are looked up on the way to what would be opened."""
+        if not self._name.usb_id:
+            return set() if self._name.scheme and self.path() == self._port else set(_steps_to(self.path()))
+        steps = set(_steps_to(_DEV / "bus/usb"))
+        for device in self._usb_devices():
+            with contextlib.suppress(OSError, ValueError):  # just unplugged
+                bus, address = int(_read(device / "busnum")), int(_read(device / "devnum"))
+                steps.update(_steps_to(_DEV / f"bus/usb/{bus:03}/{address:03}"))
+        return steps
+
+
+def _steps_to(path: str | Path) -> Iterator[str]:
+    """The names that the kernel looks up to open `path`, links followed: /dev, …, /dev/ttyUSB0."""
+    here = "/"
+    parts = deque(Path(path).parts[1:])
+    links = 0
+    while parts and links <= _LINKS_MAX:
+        name = parts.popleft()
+        if name == "..":
+            here = os.path.dirname(here)  # noqa: PTH120 - a text, as inotify's
+            continue
+        step = os.path.join(here, name)  # noqa: PTH118
+        yield step
+        try:
+            target = Path(step).readlink()
+        except OSError:  # no link, or nothing at all
+            here = step
+            continue
+        links += 1
+        if target.is_absolute():
+            here = "/"
+        parts.extendleft(reversed(target.parts[1:] if target.is_absolute() else target.parts))
+
+
+def _is_directory(path: str) -> bool:
+    """Itself, and no link to one."""
+    try:
+        return stat.S_ISDIR(os.lstat(path).st_mode)
+    except OSError:
         return False
-
-    def _set_membership(self, option: int) -> None:
-        if self._socket:
-            for group in _GROUPS:
-                with contextlib.suppress(OSError):
-                    self._socket.setsockopt(_SOL_NETLINK, option, group)
-
-    def _read_events(self) -> tuple[list[dict[str, str]], bool]:
-        """All that wait, and whether the kernel had to throw some away."""
-        events, some_lost = [], False
-        while self._socket:
-            try:
-                events.append(_properties(self._socket.recv(_EVENT_SIZE)))
-            except OSError as error:
-                if error.errno not in {errno.ENOBUFS, errno.EINTR}:  # EAGAIN: that was all
-                    break
-                some_lost = some_lost or error.errno == errno.ENOBUFS
-        return events, some_lost
 
 
 def _identity(terminal: os.stat_result) -> tuple[int, int]:
@@ -182,12 +246,3 @@ def _identity(terminal: os.stat_result) -> tuple[int, int]:
 
 def _read(file: Path) -> str:
     return file.read_text().strip()
-
-
-def _properties(event: bytes) -> dict[str, str]:
-    """`add@/devices/…\\0ACTION=add\\0SUBSYSTEM=tty\\0…`; udev's has a binary header instead of the first."""
-    start = 0
-    if event.startswith(_UDEV_PREFIX) and len(event) >= _UDEV_OFFSET.size:
-        (start,) = _UDEV_OFFSET.unpack_from(event)
-    pairs = (line.partition("=") for line in event[start:].decode(errors="replace").split("\0"))
-    return {key: value for key, equals, value in pairs if equals}

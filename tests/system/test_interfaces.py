@@ -184,7 +184,7 @@ def test_a_usb_device_is_known_by_its_serial_number(rig: Rig) -> None:
     adapter = {"type": "usb2can", "port": str(wrong.wait_tty()), "serial_number": right.serial_number}
     bridge = rig.bridge(configuration(Path(), near) | {"adapter": adapter})
     bridge.wait_state("running")
-    wait_log(bridge, f"{right.wait_tty()} has the serial number that is wanted, not {wrong.wait_tty()}")
+    wait_log(bridge, f"{right.wait_tty()} is opened for {wrong.wait_tty()}, by its serial number")
     bridge.stop_cleanly()
 
 

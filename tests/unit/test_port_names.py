@@ -15,6 +15,10 @@ from bridged.ports.names import SCHEMES, PortName
         ("rfc2217://[fe80::1%eth0]:65535/?x=1", ("rfc2217", "", ("fe80::1%eth0", 65535), None, None)),
         ("usb://0403:6001", ("usb", "", None, (0x0403, 0x6001), None)),
         ("usb://0403:6aB1/A6008isP", ("usb", "", None, (0x0403, 0x6AB1), "A6008isP")),
+        ("usb-serial://A6008isP", ("usb-serial", "", None, None, "A6008isP")),
+        ("usb-serial://a/b:c-01", ("usb-serial", "", None, None, "a/b:c-01")),
+        ("usb-serial://", ("usb-serial", "", None, None, None)),
+        ("usb-serial://two words", ("usb-serial", "", None, None, None)),
         ("socket://nas:0", ("socket", "", None, None, None)),
         ("socket://nas:65536", ("socket", "", None, None, None)),
         ("socket://-", ("socket", "", None, None, None)),
@@ -33,7 +37,8 @@ def test_parts(text: str, parts: tuple[object, ...]) -> None:
 def test_a_name_without_a_problem_says_what_to_open(text: str) -> None:
     name = PortName(text)
     if name.problem() is None:
-        assert [bool(part) for part in (name.path, name.address, name.usb_id)].count(True) == 1
+        parts = (name.path, name.address, name.usb_id, name.is_tty_of_usb_device)
+        assert [bool(part) for part in parts].count(True) == 1
         assert name.scheme in ("", *SCHEMES)
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import serial
+from benches.machine import Machine
 from serial import rfc2217
 
 from bridged.errors import PortError
@@ -350,6 +351,44 @@ class TestTtyErrors:
     def test_impossible_baudrate(self, pty_pair: tuple[int, str], baudrate: int) -> None:
         with pytest.raises(PortError, match=str(baudrate)):
             open_port(pty_pair[1], baudrate)
+
+
+class TestTtyOfUsbDevice:
+    """usb-serial://SERIAL"""
+
+    @pytest.fixture
+    def machine(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+        return Machine(tmp_path, monkeypatch)
+
+    def test_opens_what_has_the_serial_number(self, machine: Machine, pty_pair: tuple[int, str]) -> None:
+        machine.plug("ttyUSB0", "B2")
+        node = machine.plug("ttyUSB1", "A1")
+        node.unlink()
+        node.symlink_to(pty_pair[1])
+        port = open_port("usb-serial://A1", 57600)
+        assert port.description == str(node)
+        port.close()
+
+    def test_missing_names_what_is_there(self, machine: Machine) -> None:
+        text = "^usb-serial://A1: no USB device with a serial line has this serial number; those here: "
+        with pytest.raises(PortError, match=f"{text}none$"):
+            open_port("usb-serial://A1", 57600)
+        machine.plug("ttyUSB1", "B2")
+        machine.plug("ttyUSB0")  # of a device without serial number
+        with pytest.raises(PortError, match=rf"{text}B2 \({machine.dev}/ttyUSB1\)$"):
+            open_port("usb-serial://A1", 57600)
+
+    def test_two_devices_alike_are_both_named(self, machine: Machine) -> None:
+        machine.plug("ttyUSB0", "A1")
+        machine.plug("ttyACM0", "A1")
+        with pytest.raises(PortError) as caught:
+            open_port("usb-serial://A1", 57600)
+        for text in ("2 devices have", f"{machine.dev}/ttyUSB0 (", f"{machine.dev}/ttyACM0 (", "by-path"):
+            assert text in str(caught.value)
+
+    def test_malformed(self) -> None:
+        with pytest.raises(PortError, match="not of the form usb-serial://SERIAL"):
+            open_port("usb-serial://", 57600)
 
 
 @pytest.fixture

@@ -44,6 +44,32 @@ def test_product(tty: Path) -> None:
     assert sysfs.product(tty) == "CANtact dev"
 
 
+def test_usb_ttys(machine: Path, tty: Path) -> None:
+    """Each device's in the order of its interfaces; what is no USB device's is none."""
+    places = {
+        "ttyUSB10": "usb1/1-4/1-4:1.1/ttyUSB10",  # the second line of the device of ttyUSB0
+        "ttyACM0": "usb1/1-2/1-2:1.10",
+        "ttyACM1": "usb1/1-2/1-2:1.2",
+        "ttyS0": "pnp0/00:01",
+    }
+    (machine / "sys/class/tty").mkdir(parents=True)
+    (machine / "sys/class/tty/ttyUSB0").symlink_to(tty)
+    (machine / "sys/class/tty/console").symlink_to(tty)
+    for name, place in places.items():
+        directory = machine / "sys/devices" / place / "tty" / name
+        directory.mkdir(parents=True)
+        (machine / "sys/class/tty" / name).symlink_to(directory)
+    (machine / "sys/devices/usb1/1-2/idVendor").write_text("1209\n")
+    found = [(text.device, text.interface, text.name, number) for text, number in sysfs.usb_ttys().items()]
+    assert found == [
+        ("1-2", 2, "ttyACM1", ""),
+        ("1-2", 10, "ttyACM0", ""),
+        ("1-4", 0, "ttyUSB0", "A6001234"),
+        ("1-4", 1, "ttyUSB10", "A6001234"),
+    ]
+    assert [text.name for text in sysfs.usb_ttys_of("A6001234")] == ["ttyUSB0", "ttyUSB10"]
+
+
 def test_no_usb_device(machine: Path) -> None:
     assert sysfs.serial_number(machine) is None
 

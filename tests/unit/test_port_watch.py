@@ -5,30 +5,15 @@ from __future__ import annotations
 import select
 import shutil
 import socket
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from benches.machine import Machine, kernel_event, udev_event
 
-from bridged.ports import sysfs, watch
-from bridged.ports.watch import Watch, _properties
-
-
-def kernel_event(**properties: str) -> bytes:
-    lines = [f"add@{properties['DEVPATH']}", *(f"{key}={value}" for key, value in properties.items())]
-    return "".join(f"{line}\0" for line in lines).encode()
-
-
-def udev_event(**properties: str) -> bytes:
-    """Systemd's device-monitor.c: prefix, magic, size of the header, offset and length, four hashes."""
-    body = "".join(f"{key}={value}\0" for key, value in properties.items()).encode()
-    return (
-        b"libudev\0"
-        + struct.pack(">I", 0xFEEDCAFE)
-        + struct.pack("=7I", 40, 40, len(body), 1, 2, 3, 4)
-        + body
-    )
+from bridged.ports import uevents, watch
+from bridged.ports.uevents import Uevents
+from bridged.ports.watch import Watch
 
 
 def tty_event(name: str, action: str = "add", *, udev: bool = False) -> bytes:
@@ -43,51 +28,11 @@ def usb_event(product: str, devtype: str = "usb_device") -> bytes:
     )
 
 
-class Machine:
-    """A /dev and a /sys without anything in it; `events` stands for the kernel."""
-
-    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.dev, self.sys = root / "dev", root / "sys"
-        self.watches: list[Watch] = []
-        self.dev.mkdir()
-        (self.sys / "class/tty").mkdir(parents=True)
-        (self.sys / "bus/usb/devices").mkdir(parents=True)
-        monkeypatch.setattr(watch, "_DEV", self.dev)
-        monkeypatch.setattr(watch, "_SYS", self.sys)
-        monkeypatch.setattr(sysfs, "_SYS", self.sys)
-
-    def plug(self, name: str, serial: str | None = None) -> Path:
-        usb = self.sys / "devices" / name
-        directory = usb / f"1-1:1.0/{name}/tty/{name}"
-        directory.mkdir(parents=True)
-        (usb / "idVendor").write_text("0403\n")
-        (usb / "idProduct").write_text("6001\n")
-        if serial:
-            (usb / "serial").write_text(f"{serial}\n")
-        (self.sys / "class/tty" / name).symlink_to(directory)
-        (self.sys / "bus/usb/devices" / name).symlink_to(usb)
-        (self.sys / "bus/usb/devices" / f"{name}:1.0").mkdir()  # its interface
-        (self.dev / name).touch()
-        return self.dev / name
-
-    def watch(self, port: Path | str, serial_number: str | None = None) -> Watch:
-        self.watches.append(Watch(str(port), serial_number))
-        return self.watches[-1]
-
-    def unplug(self, name: str) -> None:
-        (self.dev / name).unlink()
-        for folder in ("class/tty", "bus/usb/devices"):
-            (self.sys / folder / name).unlink()
-        (self.sys / "bus/usb/devices" / f"{name}:1.0").rmdir()
-        shutil.rmtree(self.sys / "devices" / name)
-
-
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Machine]:
     made = Machine(tmp_path, monkeypatch)
     yield made
-    for looking in made.watches:
-        looking.close()
+    made.close()
 
 
 def told(looking: Watch, *events: bytes) -> bool:
@@ -95,7 +40,7 @@ def told(looking: Watch, *events: bytes) -> bool:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     near.setblocking(False)
     looking.close()
-    looking._socket = near
+    looking._uevents = Uevents(near)
     for event in events:
         far.send(event)
     far.close()
@@ -103,28 +48,6 @@ def told(looking: Watch, *events: bytes) -> bool:
         return looking.has_come()
     finally:
         looking.close()
-
-
-def test_properties_of_both_senders() -> None:
-    wanted = {"ACTION": "add", "DEVPATH": "/d", "X": "a=b", "EMPTY": ""}
-    assert _properties(kernel_event(**wanted)) == wanted
-    assert _properties(udev_event(**wanted)) == wanted
-
-
-@pytest.mark.parametrize(
-    "junk",
-    [
-        b"",
-        b"\0\0",
-        b"libudev\0",
-        b"libudev\0" + bytes(16),
-        b"libudev\0" + b"\xff" * 40,
-        b"\xff=\xfe\0",
-        b"=\0=",
-    ],
-)
-def test_junk_is_no_device(machine: Machine, junk: bytes) -> None:
-    assert not told(machine.watch(machine.plug("ttyUSB0")), junk)
 
 
 @pytest.mark.parametrize("udev", [False, True])
@@ -173,6 +96,24 @@ def test_the_same_device_at_another_path(machine: Machine) -> None:
     assert machine.watch("socket://h:1", "A1").path() == "socket://h:1"
 
 
+def test_the_tty_of_a_usb_device(machine: Machine) -> None:
+    """Whatever the kernel calls it; and of two with the same serial number none is taken."""
+    url = "usb-serial://A1"
+    looking = machine.watch(url)
+    assert (looking.path(), looking.is_there()) == (url, False)
+    machine.plug("ttyUSB0", "B2")
+    assert not looking.is_there()
+    for name in ("ttyUSB1", "ttyACM0"):
+        node = machine.plug(name, "A1")
+        assert (looking.path(), looking.is_there()) == (str(node), True)
+        assert told(machine.watch(url), tty_event(name))
+        assert not told(machine.watch(url), tty_event("ttyUSB0"), tty_event(name, "remove"))
+        machine.unplug(name)
+    machine.plug("ttyUSB1", "A1")
+    machine.plug("ttyUSB2", "A1")
+    assert (looking.path(), looking.is_there()) == (url, True)
+
+
 @pytest.mark.parametrize(
     ("url", "there"),
     [
@@ -209,7 +150,8 @@ def test_what_cannot_be_looked_for_is_taken_to_be_there(
     def refuse(*_args: object) -> None:
         raise OSError
 
-    monkeypatch.setattr(watch.socket, "socket", refuse)
+    monkeypatch.setattr(uevents.socket, "socket", refuse)
+    monkeypatch.setattr(watch.select, "epoll", refuse)
     looking = machine.watch(port)
     assert (looking.fd, looking.is_there(), looking.has_come()) == (-1, True, False)
     looking.arm()
@@ -234,7 +176,7 @@ def test_lost_events_are_reason_enough_to_look(machine: Machine) -> None:
     looking = machine.watch(machine.dev / "ttyUSB0")
     for there in (False, True):
         looking.close()
-        looking._socket = Overflowing()  # type: ignore[assignment]
+        looking._uevents = Uevents(Overflowing())  # type: ignore[arg-type]
         assert looking.has_come() is there
         if not there:
             machine.plug("ttyUSB0")
