@@ -21,6 +21,10 @@ class PortError(BridgeError):
     """The port could not be opened, or is gone: cable pulled, no permission, host not reachable."""
 
 
+class NotPermittedError(PortError):
+    """The port may not be opened: perhaps not yet, udev permits it a moment after the kernel has made it."""
+
+
 class AdapterError(BridgeError):
     """The device on the port did not do what its manual says: no answer, a refusal, the wrong device."""
 

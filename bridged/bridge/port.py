@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from bridged.bridge.kept_port import KeptPort
 from bridged.bridge.lifecycle import Event, Verdict
-from bridged.errors import PortError
+from bridged.errors import NotPermittedError, PortError
 from bridged.ports.sharing import Sharing
 
 if TYPE_CHECKING:
@@ -29,6 +29,9 @@ LAST_WORDS_S = 0.1
 # A device that was plugged in is tried again and again so long: libusb lists it, and udev lets us open it, a
 # moment after the kernel has told of it.
 SETTLE_S, SETTLE_RETRY_S = 5.0, 0.1
+# A port that may not be opened is tried so long before that is an error: the same moment, of whose end a
+# container is not told.
+REFUSED_S = 1.0
 
 
 class PortOpener:
@@ -108,6 +111,9 @@ class AdapterPort:
         self._kept = KeptPort(relay)
         self._sharing = Sharing()
         self._settles_by: float | None = None  # what was plugged in may not be usable before that
+        self._refused_at: float | None = None  # since when it may not be opened
+        self._open_again_at: float | None = None
+        self._baudrate = 0
 
     def filenos(self) -> tuple[int, ...]:
         watch = (self._watch.fd,) if self._watch.fd >= 0 else ()
@@ -121,10 +127,14 @@ class AdapterPort:
     @property
     def next_at(self) -> float | None:
         """When on_timer() is to be called."""
-        return self._sharing.next_at
+        times = (self._sharing.next_at, self._open_again_at)
+        return min((time for time in times if time is not None), default=None)
 
     def on_timer(self, now: float) -> None:
         self._sharing.on_timer(now)
+        if self._open_again_at is not None and now >= self._open_again_at:
+            self._open_again_at = None
+            self._opener.start(self._baudrate)
 
     # --- the device comes ---------------------------------------------------------------------
 
@@ -133,7 +143,9 @@ class AdapterPort:
         self._watch.arm()
 
     def stop_watching(self) -> None:
+        """Nor is it tried again."""
         self._watch.disarm()
+        self._open_again_at = None
 
     def is_there(self) -> bool:
         """Whether there is a device to open; True where nobody can know."""
@@ -152,6 +164,7 @@ class AdapterPort:
     def open(self, baudrate: int) -> None:
         """Starts to open it; on_readable() tells how that ends."""
         self._watch.disarm()
+        self._baudrate = baudrate
         kept = self._kept.take()
         if kept is None:
             self._opener.start(baudrate)
@@ -163,6 +176,14 @@ class AdapterPort:
         result = self._opener.result()
         if result is None:
             return None
+        if isinstance(result, NotPermittedError):
+            now = time.monotonic()
+            self._refused_at = now if self._refused_at is None else self._refused_at
+            if wanted and now < self._refused_at + REFUSED_S:
+                self._open_again_at = now + SETTLE_RETRY_S
+                return None
+        else:
+            self._refused_at = None
         if isinstance(result, PortError):
             if wanted:
                 self._watch.arm()  # before the look, or the device might come between

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import grp
 import logging
 import os
-import pwd
 import socket
 import stat
 import struct
@@ -19,9 +17,10 @@ from typing import Any, Final
 
 import serial
 
-from bridged.errors import BridgeError, PortError
+from bridged.errors import BridgeError, NotPermittedError, PortError
 from bridged.ports import sysfs
 from bridged.ports.names import PortName
+from bridged.ports.permission import explain_forbidden, explain_refused
 from bridged.ports.pump import POLL_INTERVAL_S, Pump
 
 _log = logging.getLogger(__name__)
@@ -71,7 +70,7 @@ def open_serial(name: PortName, baudrate: int) -> TtyPort | TcpPort | PumpedPort
         # Any: the stub promises serial.Serial whatever the URL.
         device: Any = serial.serial_for_url(port, baudrate=baudrate, exclusive=True, timeout=POLL_INTERVAL_S)
     except (OSError, ValueError, OverflowError, termios.error) as error:
-        raise PortError(_explain(port, baudrate, error)) from error
+        raise _error(port, baudrate, error) from error
     if isinstance(device, serial.Serial):  # a path; hwgrep:// and alt:// end in a tty, too
         return TtyPort(port, baudrate, device)
     return PumpedPort(port, device)
@@ -90,7 +89,7 @@ class TtyPort:
             actual = _actual_baudrate(self.fd)
         except (OSError, termios.error) as error:
             self.close()
-            raise PortError(_explain(description, baudrate, error)) from error
+            raise _error(description, baudrate, error) from error
         if abs(actual - baudrate) > baudrate * _BAUDRATE_TOLERANCE:
             self.close()
             raise PortError(f"{description}: the driver cannot do {baudrate} Bd, it chose {actual} Bd")
@@ -249,33 +248,38 @@ def _notice_dead_peers(connection: socket.socket) -> None:
         connection.setsockopt(level, option, value)
 
 
-def _explain(port: str, baudrate: int, error: Exception) -> str:
+def _error(port: str, baudrate: int, error: Exception) -> PortError:
     """What is wrong and what to do. pyserial raises while it handles the error that tells more."""
     cause = error.__context__ if isinstance(error.__context__, OSError | termios.error) else error
     if PortName(port).scheme:
-        return _explain_network(port, cause)
+        return PortError(_explain_network(port, cause))
     code = cause.errno if isinstance(cause, OSError) else cause.args[0] if cause.args else None
+    kind = NotPermittedError if code == errno.EACCES else PortError
+    return kind(f"{port}: {_explain(port, baudrate, error, code)}")
+
+
+def _explain(port: str, baudrate: int, error: Exception, code: object) -> str:
     match code:
         case errno.ENOENT:
-            return f"{port}: {_explain_missing(Path(port))}"
-        case errno.EACCES | errno.EPERM:
-            return f"{port}: {_explain_permission(Path(port))}"
+            return _explain_missing(Path(port))
+        case errno.EACCES:
+            return explain_refused(Path(port))
+        case errno.EPERM:
+            return explain_forbidden(Path(port).resolve())
         case errno.EBUSY | errno.EAGAIN:
             users = ", ".join(sysfs.users(Path(port))) or "another program"
-            return f"{port}: in use by {users}: stop that first"
+            return f"in use by {users}: stop that first"
         case errno.ENOTTY if _is_tty_name(port):  # another line discipline has it, as of slcand
             holders = ", ".join(sysfs.users(Path(port))) or "another program"
-            return f"{port}: in use by {holders}: stop that first"
+            return f"in use by {holders}: stop that first"
         case errno.ENOTTY | errno.EISDIR:
-            return f"{port}: not a serial port"
+            return "not a serial port"
         case errno.EIO | errno.ENXIO | errno.ENODEV:
-            return (
-                f"{port}: there is no device behind it, it was perhaps just unplugged ({os.strerror(code)})"
-            )
+            return f"there is no device behind it, it was perhaps just unplugged ({os.strerror(code)})"
         case int():
-            return f"{port}: cannot be set to {baudrate} Bd: {os.strerror(code)}"
+            return f"cannot be set to {baudrate} Bd: {os.strerror(code)}"
         case _:
-            return f"{port}: cannot be set to {baudrate} Bd: {error}"
+            return f"cannot be set to {baudrate} Bd: {error}"
 
 
 def _is_tty_name(port: str) -> bool:
@@ -291,26 +295,6 @@ def _explain_missing(path: Path) -> str:
     patterns = ("serial/by-id/*", "ttyUSB*", "ttyACM*")
     present = [str(device) for pattern in patterns for device in sorted(_DEV.glob(pattern))]
     return f"does not exist; serial adapters here: {', '.join(present) or 'none'}"
-
-
-def _explain_permission(path: Path) -> str:
-    try:
-        status = path.stat()
-    except OSError:
-        return "no permission to look into its folder"
-    if not stat.S_ISCHR(status.st_mode):
-        return "not a serial port"
-    uid = os.geteuid()
-    try:
-        user = pwd.getpwuid(uid).pw_name
-        group = grp.getgrgid(status.st_gid).gr_name
-    except KeyError:
-        user, group = str(uid), str(status.st_gid)
-    if status.st_mode & 0o060 == 0o060 and uid != 0 and status.st_gid not in {os.getegid(), *os.getgroups()}:
-        return f"user {user} has no permission: add it to group {group} (`usermod -aG {group} {user}`)"
-    owner = f"{stat.filemode(status.st_mode)}, group {group}"
-    service = ", and DeviceAllow= of the service" if "NOTIFY_SOCKET" in os.environ else ", or be root"
-    return f"user {user} has no permission ({owner}): check the udev rule that gives it to a group{service}"
 
 
 def _explain_network(url: str, cause: BaseException) -> str:

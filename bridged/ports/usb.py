@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import errno
 import os
-import pwd
 import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -19,8 +18,9 @@ import usb.core
 import usb.util
 from usb.core import USBError, USBTimeoutError
 
-from bridged.errors import PortError
+from bridged.errors import NotPermittedError, PortError
 from bridged.ports import sysfs
+from bridged.ports.permission import explain_forbidden, explain_missing_group, user_name
 from bridged.ports.pump import POLL_INTERVAL_S, Pump
 from bridged.text import printable
 
@@ -66,7 +66,8 @@ def open_usb(name: PortName) -> UsbPort:
     try:
         chip = _Chip(url, device)
     except USBError as error:
-        raise PortError(f"{url}: {_explain(device, error)}") from error
+        kind = NotPermittedError if error.errno == errno.EACCES else PortError
+        raise kind(f"{url}: {_explain(device, error)}") from error
     return UsbPort(url, chip, serial_number)
 
 
@@ -261,10 +262,10 @@ def _node(device: Any) -> Path:
 
 def _explain(device: Any, error: USBError) -> str:
     """What is wrong and what to do."""
-    node = _DEV / "bus/usb" / f"{device.bus:03}" / f"{device.address:03}"
+    node = _node(device)
     match error.errno:
         case errno.EACCES:
-            return _explain_permission(device, node)
+            return _explain_refused(device, node)
         case errno.EBUSY:
             ourselves = f"(process {os.getpid()})"
             users = [user for user in sysfs.users(node) if not user.endswith(ourselves)]
@@ -274,17 +275,16 @@ def _explain(device: Any, error: USBError) -> str:
         case errno.ENODEV | errno.ENOENT:
             return f"it was just unplugged ({error.strerror})"
         case errno.EIO if not os.access(node, os.R_OK | os.W_OK):  # libusb's name for EPERM
-            return f"{node} may not be opened: check DeviceAllow= of the service (char-usb_device rw)"
+            return explain_forbidden(node)
         case _:
             return f"cannot be opened: {error.strerror}"
 
 
-def _explain_permission(device: Any, node: Path) -> str:
-    uid = os.geteuid()
-    try:
-        user = pwd.getpwuid(uid).pw_name
-    except KeyError:
-        user = str(uid)
+def _explain_refused(device: Any, node: Path) -> str:
+    with contextlib.suppress(OSError):  # just unplugged
+        if missing := explain_missing_group(node.stat()):
+            return f"{node}: {missing}"
+    user = user_name()
     attributes = f'ATTR{{idVendor}}=="{device.idVendor:04x}", ATTR{{idProduct}}=="{device.idProduct:04x}"'
     rule = f'SUBSYSTEM=="usb", {attributes}, MODE="0660", GROUP="plugdev"'
     return (

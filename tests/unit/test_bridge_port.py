@@ -12,7 +12,7 @@ from benches.bridge import Bench, run_until, started, stopped
 from bridged.bridge import port as port_module
 from bridged.bridge.bridge import Bridge
 from bridged.bridge.lifecycle import State
-from bridged.errors import PortError
+from bridged.errors import NotPermittedError, PortError
 from bridged.ports import Port, open_port
 from bridged.ports.watch import Watch
 from bridged.simulators.can232 import Can232
@@ -58,6 +58,56 @@ def plugged_in(bench: Bench, failures: int) -> tuple[Bridge, list[str]]:
         kernel.send(f"add@/x\0ACTION=add\0SUBSYSTEM=tty\0DEVNAME={name}\0".encode())
         run_until(bridge, lambda: len(tries) > 0)
     return bridge, tries
+
+
+@pytest.mark.parametrize("patient", [True, False])
+def test_permission_comes_a_moment_after_the_device(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, patient: bool
+) -> None:
+    """What is refused meanwhile is no error; after that time it is."""
+    monkeypatch.setattr(port_module, "REFUSED_S", 1000.0 if patient else 0.0)
+    monkeypatch.setattr(port_module, "SETTLE_RETRY_S", 0.0)
+    tries, refusals = 0, 5
+
+    def open_late(path: str, baudrate: int) -> Port:
+        nonlocal tries
+        tries += 1
+        if tries <= refusals:
+            raise NotPermittedError("not permitted")
+        return open_port(path, baudrate)
+
+    bench.open_port = open_late
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge(more="reconnect: {initial: 0.01, maximum: 0.01}"))
+    assert tries == refusals + 1
+    assert ("not permitted" in caplog.text) is not patient
+    assert ("state=backoff" in caplog.text) is not patient
+    stopped(bridge)
+
+
+def test_a_refusal_that_lasts_is_an_error_each_time(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And does not hold up the end meanwhile."""
+    monkeypatch.setattr(port_module, "REFUSED_S", 0.01)
+    monkeypatch.setattr(port_module, "SETTLE_RETRY_S", 0.001)
+    tries = 0
+
+    def refuse(_path: str, _baudrate: int) -> Port:
+        nonlocal tries
+        tries += 1
+        raise NotPermittedError("not permitted")
+
+    bench.open_port = refuse
+    bench.plug_in(Can232(time.monotonic()))
+    bridge = started(bench.bridge(more="reconnect: {initial: 0.02, maximum: 0.02}"), State.BACKOFF)
+    assert tries > 1
+    assert bridge.reason == "not permitted"
+    before = tries
+    run_until(bridge, lambda: bridge.state is State.OPENING)
+    run_until(bridge, lambda: bridge.state is State.BACKOFF)
+    assert tries == before + 1
+    monkeypatch.setattr(port_module, "REFUSED_S", 1000.0)
+    run_until(bridge, lambda: bridge.state is State.OPENING)
+    stopped(bridge)
 
 
 def test_a_numbered_terminal_is_not_taken_again(bench: Bench) -> None:

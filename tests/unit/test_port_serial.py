@@ -23,8 +23,8 @@ import serial
 from benches.machine import Machine
 from serial import rfc2217
 
-from bridged.errors import PortError
-from bridged.ports import open_port, sysfs
+from bridged.errors import NotPermittedError, PortError
+from bridged.ports import open_port, permission, sysfs
 from bridged.ports import serial as ports
 
 if TYPE_CHECKING:
@@ -300,12 +300,35 @@ class TestTtyErrors:
             (0o660, r"user nobody has no permission: add it to group tty \(`usermod -aG tty nobody`\)"),
         ],
     )
-    def test_no_permission(self, pty_pair: tuple[int, str], mode: int, text: str) -> None:
+    def test_no_permission(
+        self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch, mode: int, text: str
+    ) -> None:
+        monkeypatch.setattr(permission, "_in_container", lambda: False)
         path = pty_pair[1]
         shutil.chown(path, "root", "tty")
         Path(path).chmod(mode)
-        with as_nobody(), pytest.raises(PortError, match=text):
+        with as_nobody(), pytest.raises(NotPermittedError, match=text):
             open_port(path, 57600)
+
+    def test_not_in_the_device_cgroup(
+        self, pty_pair: tuple[int, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The error names the rule; its device is the one behind a link."""
+        link = tmp_path / "adapter"
+        link.symlink_to(pty_pair[1])
+
+        def forbid(*_: object, **__: object) -> int:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+        major = os.major(link.stat().st_rdev)
+        monkeypatch.setattr(permission, "_in_service", lambda: False)
+        monkeypatch.setattr(os, "open", forbid)
+        monkeypatch.setattr(ports, "_refuse_terminal", lambda _: None)
+        with pytest.raises(PortError) as caught:
+            open_port(str(link), 57600)
+        assert type(caught.value) is PortError
+        assert str(caught.value).startswith(f"{link}: {pty_pair[1]} is none of the devices")
+        assert f'--device-cgroup-rule="c {major}:* rmw"' in str(caught.value)
 
     def test_not_a_tty(self, tmp_path: Path) -> None:
         (tmp_path / "file").touch()

@@ -17,7 +17,7 @@ import usb.backend.libusb1
 from benches.fake_libusb import Chip, FakeLibusb, usb_error
 from usb.core import USBError
 
-from bridged.errors import PortError
+from bridged.errors import NotPermittedError, PortError
 from bridged.ports import open_port, sysfs
 from bridged.ports import usb as ports
 from bridged.ports.usb import strip_status
@@ -312,7 +312,7 @@ class TestChoice:
 class TestErrors:
     def test_no_permission(self, chip: Chip, machine: Path) -> None:
         chip.refuse["open"] = errno.EACCES
-        with pytest.raises(PortError) as caught:
+        with pytest.raises(NotPermittedError) as caught:
             open_port(URL, 57600)
         text = str(caught.value)
         rule = (
@@ -322,10 +322,16 @@ class TestErrors:
             assert part in text
         assert "udevadm control --reload && udevadm trigger" in text
 
-    def test_service_without_the_device(self, chip: Chip) -> None:
+    def test_not_in_the_device_cgroup(
+        self, chip: Chip, machine: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """libusb says EIO for EPERM."""
         chip.refuse["open"] = errno.EIO
-        with pytest.raises(PortError, match=r"may not be opened: check DeviceAllow= .*char-usb_device rw"):
+        forbidden: list[Path] = []
+        monkeypatch.setattr(ports, "explain_forbidden", lambda node: forbidden.append(node) or "forbidden")
+        with pytest.raises(PortError, match=f"^{URL}: forbidden$"):
             open_port(URL, 57600)
+        assert forbidden == [machine / "dev/bus/usb/001/004"]
 
     def test_in_use_by_another_bridge(self, chip: Chip, monkeypatch: pytest.MonkeyPatch) -> None:
         chip.driver = False

@@ -1,0 +1,102 @@
+"""Why a device node may not be opened, and what to do about it: on a host, in a service, in a container."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import stat
+from pathlib import Path
+from typing import Final
+
+_PROC: Final = Path("/proc")
+_CONTAINER_MARKS: Final = (Path("/run/.containerenv"), Path("/.dockerenv"))  # of podman, of docker
+
+_NO_SUCH_GROUP: Final = 65_534  # how a group is shown that the user namespace has not
+
+
+def user_name() -> str:
+    """Of this process."""
+    uid = os.geteuid()
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def explain_refused(node: Path) -> str:
+    """EACCES: its mode, owner and group do not let this process in."""
+    try:
+        status = node.stat()
+    except OSError:
+        return "no permission to look into its folder"
+    if not stat.S_ISCHR(status.st_mode):
+        return "not a serial port"
+    if missing := explain_missing_group(status):
+        return missing
+    owner = f"{stat.filemode(status.st_mode)}, group {_group_name(status.st_gid)}"
+    service = ", and DeviceAllow= of the service" if _in_service() else ", or be root"
+    advice = f"check the udev rule that gives it to a group{service}"
+    return f"user {user_name()} has no permission ({owner}): {advice}"
+
+
+def explain_missing_group(status: os.stat_result) -> str:
+    """What is to be done if the node's group may use it, and this process is not in that; else ""."""
+    gid = status.st_gid
+    if status.st_mode & 0o060 != 0o060 or gid in {os.getegid(), *os.getgroups()}:
+        return ""
+    user, group = user_name(), _group_name(gid)
+    if not _in_container():
+        return f"user {user} has no permission: add it to group {group} (`usermod -aG {group} {user}`)"
+    if gid == _NO_SUCH_GROUP:
+        return (
+            "its group is not known in this container: let the user who runs the container be in that group, "
+            "and run it with --group-add keep-groups (podman)"
+        )
+    return (
+        f"user {user} has no permission: run the container with --group-add {gid} "
+        f'(compose: group_add: ["{gid}"]; Kubernetes: supplementalGroups: [{gid}])'
+    )
+
+
+def explain_forbidden(node: Path) -> str:
+    """EPERM: the device cgroup, which is a list of devices, does not have it."""
+    try:
+        major = os.major(node.stat().st_rdev)
+    except OSError:
+        return f"{node} may not be opened"
+    if _in_service():
+        advice = f"add DeviceAllow=char-{_driver(major)} rw to the service"
+    else:
+        rule = f"c {major}:* rmw"
+        advice = (
+            f'run the container with --device-cgroup-rule="{rule}" (compose: '
+            f'device_cgroup_rules: ["{rule}"]; Kubernetes has no such rules: it takes a device plugin)'
+        )
+    return f"{node} is none of the devices that this program may use: {advice}"
+
+
+def _group_name(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def _driver(major: int) -> str:
+    """`ttyUSB` for 188, as /proc/devices has it; the number where it has it not."""
+    characters = (_PROC / "devices").read_text().partition("Block devices:")[0]
+    for line in characters.splitlines():
+        number, _, name = line.strip().partition(" ")
+        if number == str(major):
+            return name
+    return str(major)
+
+
+def _in_container() -> bool:
+    return "KUBERNETES_SERVICE_HOST" in os.environ or any(mark.exists() for mark in _CONTAINER_MARKS)
+
+
+def _in_service() -> bool:
+    """Whether systemd has started this program itself, and no container."""
+    return "NOTIFY_SOCKET" in os.environ and not _in_container()
