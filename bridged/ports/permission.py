@@ -46,7 +46,7 @@ def explain_missing_group(status: os.stat_result) -> str:
     if status.st_mode & 0o060 != 0o060 or gid in {os.getegid(), *os.getgroups()}:
         return ""
     user, group = user_name(), _group_name(gid)
-    if not _in_container():
+    if not in_container():
         return f"user {user} has no permission: add it to group {group} (`usermod -aG {group} {user}`)"
     if gid == _NO_SUCH_GROUP:
         return (
@@ -93,10 +93,10 @@ def _driver(major: int) -> str:
     return str(major)
 
 
-def _in_container() -> bool:
+def in_container() -> bool:
     return "KUBERNETES_SERVICE_HOST" in os.environ or any(mark.exists() for mark in _CONTAINER_MARKS)
 
 
 def _in_service() -> bool:
     """Whether systemd has started this program itself, and no container."""
-    return "NOTIFY_SOCKET" in os.environ and not _in_container()
+    return "NOTIFY_SOCKET" in os.environ and not in_container()

@@ -20,7 +20,7 @@ import serial
 from bridged.errors import BridgeError, NotPermittedError, PortError
 from bridged.ports import sysfs
 from bridged.ports.names import PortName
-from bridged.ports.permission import explain_forbidden, explain_refused
+from bridged.ports.permission import explain_forbidden, explain_refused, in_container
 from bridged.ports.pump import POLL_INTERVAL_S, Pump
 
 _log = logging.getLogger(__name__)
@@ -292,6 +292,8 @@ def _explain_missing(path: Path) -> str:
         return f"a link to {path.readlink()}, which does not exist: is the adapter unplugged?"
     if path.is_relative_to("/tmp") and "NOTIFY_SOCKET" in os.environ:
         return "does not exist: the service has a /tmp of its own (PrivateTmp=), use a path in /run"
+    if path.parent == _DEV and sysfs.has_tty(path.name) and in_container():
+        return f"there is no {path} in this container: give it the host's (--volume /dev:/dev)"
     patterns = ("serial/by-id/*", "ttyUSB*", "ttyACM*")
     present = [str(device) for pattern in patterns for device in sorted(_DEV.glob(pattern))]
     return f"does not exist; serial adapters here: {', '.join(present) or 'none'}"

@@ -20,6 +20,11 @@ def tty_directory(fd: int) -> Path | None:
     return link.resolve() if link.exists() else None
 
 
+def has_tty(name: str) -> bool:
+    """Whether the kernel has a tty of this name, `ttyUSB0`, with or without a node in /dev."""
+    return (_SYS / "class/tty" / name).exists()
+
+
 class UsbTty(NamedTuple):
     """A serial line of a USB device."""
 

@@ -303,7 +303,7 @@ class TestTtyErrors:
     def test_no_permission(
         self, pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch, mode: int, text: str
     ) -> None:
-        monkeypatch.setattr(permission, "_in_container", lambda: False)
+        monkeypatch.setattr(permission, "in_container", lambda: False)
         path = pty_pair[1]
         shutil.chown(path, "root", "tty")
         Path(path).chmod(mode)
@@ -399,6 +399,13 @@ class TestTtyOfUsbDevice:
         machine.plug("ttyUSB1", "B2")
         machine.plug("ttyUSB0")  # of a device without serial number
         with pytest.raises(PortError, match=rf"{text}B2 \({machine.dev}/ttyUSB1\)$"):
+            open_port("usb-serial://A1", 57600)
+
+    def test_a_container_without_its_node(self, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+        node = machine.plug("ttyUSB1", "A1")
+        node.unlink()
+        monkeypatch.setattr(permission, "_CONTAINER_MARKS", (machine.dev,))
+        with pytest.raises(PortError, match=f"there is no {node} in this container: .*--volume /dev:/dev"):
             open_port("usb-serial://A1", 57600)
 
     def test_two_devices_alike_are_both_named(self, machine: Machine) -> None:
