@@ -37,6 +37,20 @@ def runtime_directories() -> set[Path]:
     return folders
 
 
+def status_sockets(folder: Path) -> set[Path]:
+    """Those in a runtime directory: `NAME.sock`, and `NAME/NAME.sock` of the service, whose instances have a
+    directory each."""
+    return {
+        *folder.glob("*.sock"),
+        *(path for path in folder.glob("*/*.sock") if path.stem == path.parent.name),
+    }
+
+
+def runtime_directory_of(socket: Path) -> Path:
+    """The runtime directory that a status socket is in: see status_sockets()."""
+    return socket.parent.parent if socket.parent.name == socket.stem else socket.parent
+
+
 def distrust(directory: os.stat_result) -> str:
     """Why our sockets must not be in the directory; empty: they may."""
     if os.geteuid() == 0:  # it is in /run, where only root may write

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from bridged.bridge.lifecycle import State
 from bridged.bridge.log_limiter import LogLimiter, repeated
+from bridged.daemon.directories import runtime_directory_of, status_sockets
 from bridged.daemon.status import StatusError, query
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ REPETITIONS = 5  # of the glimpses
 
 
 class Neighbours:
-    """`own`: the status socket of this process; those of the others are beside it.
+    """`own`: the status socket of this process; those of the others are in the same runtime directory.
 
     The owner calls look() now and then, from the thread of the bridge. Others are asked in another one.
     """
@@ -81,7 +82,7 @@ class Neighbours:
     def _strangers(self) -> dict[Path, int]:
         """Status sockets that were not asked yet, with their inodes."""
         found = {}
-        for path in sorted(self._own.parent.glob("*.sock")):
+        for path in sorted(status_sockets(runtime_directory_of(self._own))):
             with contextlib.suppress(OSError):  # it is just being removed
                 inode = path.lstat().st_ino
                 if path != self._own and self._asked.get(path) != inode:

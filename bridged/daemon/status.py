@@ -75,7 +75,7 @@ def own_socket_path(name: str) -> Path:
 def running_sockets() -> list[Path]:
     """The status sockets there are, of this user's bridges and of root's."""
     folders = directories.runtime_directories()
-    return sorted(path for folder in folders for path in folder.glob("*.sock"))
+    return sorted(path for folder in folders for path in directories.status_sockets(folder))
 
 
 class StatusServer:
@@ -96,6 +96,7 @@ class StatusServer:
             path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
             self._directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
             self._clear_away()
+            self._refuse_a_second_one()
             with _for_owner_and_group():
                 self._socket.bind(str(path))
             self._inode = self._lstat().st_ino
@@ -152,17 +153,32 @@ class StatusServer:
                 raise StatusError(msg)
         except FileNotFoundError:
             return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-            probe.settimeout(1.0)
-            try:
-                probe.connect(str(self.path))
-            except ConnectionRefusedError:
-                self._unlink()
-                return
-            except TimeoutError:
-                pass
-        msg = f"a bridge named {self.path.stem!r} is running already (it answers on {self.path})"
-        raise StatusError(msg)
+        if _somebody_listens(self.path):
+            raise StatusError(_runs_already(self.path))
+        self._unlink()
+
+    def _refuse_a_second_one(self) -> None:
+        """StatusError: there is a bridge of this name in another directory: the service's, or one by hand."""
+        for path in directories.status_sockets(directories.runtime_directory_of(self.path)) - {self.path}:
+            with contextlib.suppress(OSError):  # gone meanwhile, or not ours to ask
+                if path.stem == self.path.stem and _somebody_listens(path):
+                    raise StatusError(_runs_already(path))
+
+
+def _somebody_listens(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return False
+        except TimeoutError:
+            pass
+    return True
+
+
+def _runs_already(path: Path) -> str:
+    return f"a bridge named {path.stem!r} is running already (it answers on {path})"
 
 
 @contextlib.contextmanager
@@ -178,7 +194,8 @@ def _for_owner_and_group() -> Iterator[None]:
         yield
     finally:
         os.umask(mask)
-        os.setegid(group)
+        if os.getegid() != group:  # the service's sandbox refuses the call, also where it changes nothing
+            os.setegid(group)
 
 
 def _cannot_make(path: Path, error: OSError) -> str:
@@ -241,7 +258,7 @@ def _who_may(path: Path) -> str:
     advice = (
         "ask as root (sudo)" if found.st_uid == 0 else f"ask as {user_name(found.st_uid)} or as root (sudo)"
     )
-    if path.parent == directories.SYSTEM_RUNTIME:
+    if directories.runtime_directory_of(path) == directories.SYSTEM_RUNTIME:
         advice += f"; to do without, install systemd/can-bridge.sysusers and join group {GROUP}"
     return f"it is the bridge of {user_name(found.st_uid)}: {advice}"
 

@@ -202,8 +202,7 @@ def _create_vcan(channel: str) -> None:
     cause = OSError(code, os.strerror(code))
     if code in {errno.EPERM, errno.EACCES}:
         raise InterfaceError(
-            f"{channel}: creating it needs CAP_NET_ADMIN: `can-bridge interface {channel}` as root, in a "
-            "container as uid 0 with --cap-add NET_ADMIN; in the service AmbientCapabilities=CAP_NET_ADMIN"
+            f"{channel}: creating it needs CAP_NET_ADMIN: {_who_may_create(channel)}"
         ) from cause
     if code == errno.EOPNOTSUPP:
         raise InterfaceError(
@@ -211,6 +210,17 @@ def _create_vcan(channel: str) -> None:
             "linux-modules-extra-$(uname -r))"
         ) from cause
     raise InterfaceError(f"{channel}: cannot be made: {cause.strerror}") from cause
+
+
+def _who_may_create(channel: str) -> str:
+    if (
+        "NOTIFY_SOCKET" in os.environ
+    ):  # deleted since the start, another one after a reload, an old installation
+        return (
+            "can-bridge-interface@.service has it, `systemctl start can-bridge-interface@NAME` makes it now; "
+            "the bridge itself may with create.conf (systemd/README.md)"
+        )
+    return f"`can-bridge interface {channel}` as root, in a container as uid 0 with --cap-add NET_ADMIN"
 
 
 def _request_link(channel: str, kind: bytes) -> int:

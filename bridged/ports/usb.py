@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import grp
 import os
 import socket
 from pathlib import Path
@@ -286,11 +287,17 @@ def _explain_refused(device: Any, node: Path) -> str:
             return f"{node}: {missing}"
     user = user_name()
     attributes = f'ATTR{{idVendor}}=="{device.idVendor:04x}", ATTR{{idProduct}}=="{device.idProduct:04x}"'
-    rule = f'SUBSYSTEM=="usb", {attributes}, MODE="0660", GROUP="plugdev"'
+    try:
+        group = grp.getgrnam(
+            "can-bridge"
+        ).gr_name  # of systemd/can-bridge.sysusers, which its udev rules name
+    except KeyError:
+        group = "plugdev"
+    rule = f'SUBSYSTEM=="usb", {attributes}, MODE="0660", GROUP="{group}"'
     return (
         f"user {user} has no permission for {node}: put the line {rule} into {_RULES}, run "
         "`udevadm control --reload && udevadm trigger --subsystem-match=usb`, "
-        f"and see to it that {user} is in group plugdev"
+        f"and see to it that {user} is in group {group}"
     )
 
 

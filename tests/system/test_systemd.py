@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
-from rig import DEADLINE_S, HOST, MONITOR, HostProcess, Rig, wait_until
+from rig import DEADLINE_S, HOST, MONITOR, Chip, HostProcess, Rig, ask_monitor, wait_until
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -49,14 +49,18 @@ def installed() -> None:
     """As systemd/README.md says."""
     if not MONITOR.exists():
         pytest.skip("only in our virtual machine: ./dev vm run")
-    Path("/etc/sysusers.d").mkdir(exist_ok=True)
-    shutil.copy(FILES / "can-bridge.sysusers", "/etc/sysusers.d/can-bridge.conf")
-    shutil.copy(FILES / "70-can-bridge.rules", "/etc/udev/rules.d")
-    shutil.copy(FILES / "can-bridge@.service", UNIT)
-    execute("systemd-sysusers")
-    execute("udevadm", "control", "--reload")
-    execute("udevadm", "trigger", "--settle", "--subsystem-match=usb", "--subsystem-match=tty")
-    execute("systemctl", "daemon-reload")
+    install(FILES)
+
+
+def install(files: Path) -> None:
+    """The commands of systemd/README.md, but for the start; all is in place when they end."""
+    execute("udevadm", "settle")
+    text = (FILES / "README.md").read_text()
+    (block,) = re.findall(
+        r"Then, in this directory, as root:\n\n```sh\n(.*?)systemctl enable", text, re.DOTALL
+    )
+    execute("sh", "-euc", f"cd {files}; {block}")
+    execute("udevadm", "settle")
 
 
 class Instance:
@@ -66,7 +70,7 @@ class Instance:
         self.name, self.interface = name, interface
         self.unit = f"can-bridge@{name}.service"
         self.file = Path("/etc/can-bridge", f"{name}.yaml")
-        self.socket = Path("/run/can-bridge", f"{name}.sock")
+        self.socket = Path("/run/can-bridge", name, f"{name}.sock")
         self._since = f"@{time.time():.3f}"  # a cursor and matches together lose the first entry
 
     def configure(
@@ -163,6 +167,28 @@ def can232(rig: Rig, instance: Callable[[str], Instance]) -> Iterator[Instance]:
     assert read_state(simulator)["channel"] == "closed"
 
 
+@contextlib.contextmanager
+def drop_in(made: Instance, name: str) -> Iterator[None]:
+    """One of our drop-ins for this instance; the next start takes it, or no longer."""
+    folder = Path(f"/etc/systemd/system/{made.unit}.d")
+    folder.mkdir()
+    try:
+        shutil.copy(FILES / name, folder)
+        execute("systemctl", "daemon-reload")
+        yield
+    finally:
+        shutil.rmtree(folder)
+        execute("systemctl", "daemon-reload")
+
+
+def can_be_plugged(chip: Chip) -> bool:
+    try:
+        chip.plug()
+    except AssertionError:
+        return False
+    return True
+
+
 def read_state(simulator: HostProcess) -> dict[str, Any]:
     file = HOST / "systemd.json"
     file.unlink(missing_ok=True)
@@ -176,7 +202,7 @@ class TestUnit:
         assert execute("systemd-analyze", "verify", "can-bridge@can232.service") == ""
 
     def test_exposure(self) -> None:
-        execute("systemd-analyze", "security", "--offline=true", "--threshold=15", UNIT)
+        execute("systemd-analyze", "security", "--offline=true", "--threshold=11", UNIT)
 
     def test_start_and_stop(self, rig: Rig, can232: Instance) -> None:
         status = can232.wait_status("running: ")
@@ -184,7 +210,9 @@ class TestUnit:
         assert status.endswith(f" on {NAMED}/RIG0001, {can232.interface}")
         process = Path("/proc", str(can232.pid))
         assert process.owner() == "can-bridge"
-        assert "CapEff:\t0000000000001000" in (process / "status").read_text()  # CAP_NET_ADMIN
+        status = (process / "status").read_text()
+        for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb"):
+            assert f"Cap{kind}:\t0000000000000000\n" in status
 
         rig.cansend(can232.interface, "123#1122")
         answer = json.loads(execute("can-bridge", "status", "--json", "--socket", can232.socket))
@@ -222,6 +250,38 @@ class TestUnit:
         finally:
             execute("systemctl", "stop", "can-bridge@simulated", "simulated-adapter", status=None)
             execute("ip", "link", "delete", "vcan0", status=None)
+
+    def test_an_interface_that_is_deleted_is_told(self, can232: Instance) -> None:
+        """The bridge may not make it anew, but takes it when its unit has; with create.conf it may."""
+        execute("ip", "link", "delete", can232.interface)
+        advice = "`systemctl start can-bridge-interface@NAME` makes it now"
+        wait_until(lambda: advice in can232.log("BRIDGE=can232", "PRIORITY=3"), "the log to tell what to do")
+        assert f"bus lost: socketcan {can232.interface}" in can232.log("PRIORITY=3")
+        execute("systemctl", "start", "can-bridge-interface@can232")
+        can232.wait_status("running: CAN232")
+
+        with drop_in(can232, "create.conf"):
+            can232.systemctl("restart")
+            can232.wait_status("running: ")
+            execute("ip", "link", "delete", can232.interface)
+            made_anew = Path(f"/sys/class/net/{can232.interface}")
+            wait_until(made_anew.exists, "the interface to be made anew")
+            can232.wait_status("running: ")
+        can232.systemctl("restart")  # its unit finds it there
+
+    def test_another_interface_after_a_reload_is_told(self, can232: Instance) -> None:
+        can232.interface, before = "cbsother", can232.interface
+        try:
+            can232.configure(NAMED / "RIG0001")
+            can232.systemctl("reload")
+            wait_until(
+                lambda: "cbsother: creating it needs CAP_NET_ADMIN: can-b" in can232.log(), "the log to tell"
+            )
+            can232.wait_status("bus not open: cbsother: creating it needs")
+            can232.systemctl("restart")
+            can232.wait_status("running: ")
+        finally:
+            execute("ip", "link", "delete", before)
 
     def test_restart(self, can232: Instance) -> None:
         pid = can232.pid
@@ -288,16 +348,19 @@ class TestUnit:
         assert "two: " in execute(*user, "--groups=can-bridge", "can-bridge", "status", "two", status=3)
 
     def test_root_runs_another_by_hand(self, instance: Callable[[str], Instance]) -> None:
-        """In the directory of the service's user."""
+        """Beside the service's; never the same one, which would be two of a name."""
         one, two = instance("one"), instance("two")
         for made in (one, two):
             made.configure("/dev/can-bridge/none")
         two.systemctl("start")
+        refused = execute("can-bridge", "run", "two", status=1)
+        assert f"a bridge named 'two' is running already (it answers on {two.socket})" in refused
+        socket_path = Path("/run/can-bridge/one.sock")
         process = subprocess.Popen(["can-bridge", "run", "one"])
         try:
-            wait_until(one.socket.is_socket, "the status socket")
-            found = one.socket.stat()
-            assert (one.socket.owner(), one.socket.group(), found.st_mode & 0o777) == (
+            wait_until(socket_path.is_socket, "the status socket")
+            found = socket_path.stat()
+            assert (socket_path.owner(), socket_path.group(), found.st_mode & 0o777) == (
                 "root",
                 "can-bridge",
                 0o660,
@@ -308,7 +371,39 @@ class TestUnit:
         finally:
             process.terminate()
             assert process.wait(DEADLINE_S) == 0
-        assert not one.socket.exists()
+        assert not socket_path.exists()
+
+    def test_upgrade(self, can232: Instance, rig: Rig) -> None:
+        """From the unit of the version before, which had the capability and one directory for all sockets.
+
+        The new program runs with the old unit, so that the two need not change in one moment.
+        """
+        can232.systemctl("stop")
+        UNIT.with_name("can-bridge-interface@.service").unlink()
+        Path("/etc/sysctl.d/10-can-bridge.conf").unlink()
+        before = FILES.parent / "tests/system/before"
+        shutil.copy(before / "can-bridge@.service", UNIT)
+        shutil.copy(before / "70-can-bridge.rules", "/etc/udev/rules.d")
+        shutil.copy(before / "can-bridge.sysusers", "/etc/sysusers.d/can-bridge.conf")
+        execute("systemctl", "daemon-reload")
+        execute("udevadm", "control", "--reload")
+        execute("udevadm", "trigger", "--settle", "--subsystem-match=tty")
+        can232.systemctl("start")
+        can232.wait_status("running: ")
+        old_socket = Path("/run/can-bridge/can232.sock")
+        assert old_socket.owner() == "can-bridge"
+        dump = rig.candump(can232.interface)
+
+        install(FILES)
+        assert (NAMED / "RIG0001").is_char_device()
+        assert "can232: running, " in execute("can-bridge", "status", "can232")  # at its old place
+        can232.systemctl("restart")
+        can232.wait_status("running: ")
+        assert can232.socket.is_socket()
+        assert not old_socket.exists()
+        assert "can232: running, " in execute("can-bridge", "status", "can232")
+        rig.cansend(can232.interface, "123#1122")
+        assert dump.finish(1) == ["123#1122"]  # the interface is the same
 
     def test_raw_usb(self, rig: Rig, instance: Callable[[str], Instance]) -> None:
         chip = rig.chip("ftdi0")
@@ -322,21 +417,14 @@ class TestUnit:
 
     def test_serial_server(self, instance: Callable[[str], Instance]) -> None:
         made = instance("server")
-        drop_in = Path(f"/etc/systemd/system/{made.unit}.d")
         with socket.create_server(("127.0.0.1", 0)) as server:
             server.settimeout(DEADLINE_S)
             made.configure(f"socket://127.0.0.1:{server.getsockname()[1]}")
             made.systemctl("start")
             made.wait_status("waiting: ")  # no internet
-            drop_in.mkdir()
-            try:
-                shutil.copy(FILES / "network.conf", drop_in)
-                execute("systemctl", "daemon-reload")
+            with drop_in(made, "network.conf"):
                 made.systemctl("restart")
                 server.accept()[0].close()
-            finally:
-                shutil.rmtree(drop_in)
-                execute("systemctl", "daemon-reload")
 
 
 class TestDevices:
@@ -350,6 +438,36 @@ class TestDevices:
             assert (Path("/sys/class/tty") / tty.name / "device/latency_timer").read_text() == "1\n"
         asked = execute("udevadm", "info", "--query=property", "--property=ID_MM_PORT_IGNORE", "--value", tty)
         assert asked == "1"
+
+    def test_a_second_device_of_a_serial_number_does_not_take_the_name(self, rig: Rig) -> None:
+        first, second = rig.chip("ftdi0"), rig.chip("ftdi1")
+        link, tty = NAMED / first.serial_number, first.wait_tty()
+        wait_until(link.exists, "the name that stays")
+        second.unplug()
+        second.serial_number, own = first.serial_number, second.serial_number
+        try:
+            ask_monitor(
+                "device_add",
+                driver="usb-serial",
+                id=second.name,
+                chardev=second.name,
+                serial=second.serial_number,
+                **{"always-plugged": True},
+            )
+            wait_until(lambda: len(list(Path("/dev").glob("ttyUSB*"))) == 2, "the second terminal")
+            execute("udevadm", "settle")
+            assert link.resolve() == tty
+            execute("udevadm", "trigger", "--settle", "--subsystem-match=tty")
+            assert link.resolve() == tty
+        finally:
+            ask_monitor("device_del", id=second.name)
+            wait_until(lambda: len(list(Path("/dev").glob("ttyUSB*"))) == 1, "the second one to be gone")
+            second.serial_number = own
+            wait_until(lambda: can_be_plugged(second), "QEMU to let go of the far end")
+        assert link.resolve() == tty
+        assert first.usb is not None
+        bus, number = (int((first.usb / name).read_text()) for name in ("busnum", "devnum"))
+        assert Path(f"/dev/bus/usb/{bus:03}/{number:03}").group() == "can-bridge"
 
     def test_power_up_without_adapter(self, rig: Rig, instance: Callable[[str], Instance]) -> None:
         """And without its driver: the device's kind must be allowed before it exists."""

@@ -31,6 +31,16 @@ def test_where_the_status_sockets_are(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert directories.runtime_directory() == Path(f"/tmp/can-bridge-{user}")
 
 
+def test_sockets_by_hand_and_of_the_service(tmp_path: Path) -> None:
+    for name in ("a.sock", "b/b.sock", "b/other.sock", "c/d/d.sock", "e/e.yaml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert directories.status_sockets(tmp_path) == {tmp_path / "a.sock", tmp_path / "b/b.sock"}
+    assert {directories.runtime_directory_of(path) for path in directories.status_sockets(tmp_path)} == {
+        tmp_path
+    }
+
+
 def test_where_the_state_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")
     assert directories.state_directory() == Path("/var/lib/a")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -53,6 +54,17 @@ class TestSocketcan:
         with pytest.raises(InterfaceError, match=f"^vcan0: .*{advice}") as caught:
             socketcan._create_vcan("vcan0")
         assert isinstance(caught.value.__cause__, OSError)
+
+    def test_the_service_has_another_unit_for_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("NOTIFY_SOCKET", "/run/systemd/notify")
+        monkeypatch.setattr(socketcan, "_request_link", lambda *_: errno.EPERM)
+        with pytest.raises(InterfaceError, match="`systemctl start can-bridge-interface@NAME` makes it now"):
+            socketcan._create_vcan("vcan0")
+
+    def test_the_sysctl_file_allows_the_buffer(self) -> None:
+        text = (Path(__file__).parents[2] / "systemd/can-bridge.sysctl").read_text()
+        for limit in ("rmem_max", "wmem_max"):
+            assert f"\nnet.core.{limit} = {socketcan._BUFFER_BYTES}\n" in text
 
     def test_somebody_else_made_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(socketcan, "_request_link", lambda *_: errno.EEXIST)

@@ -50,8 +50,11 @@ class Member:
         while not link.exists():
             time.sleep(0)
         self.bridge = Bridge(load(file), FileMemory(folder))
-        self.status = StatusServer(folder / f"{name}.sock", self.bridge.snapshot)
-        self.neighbours = Neighbours(folder / f"{name}.sock")
+        own = (
+            folder / "run" / (f"{name}.sock" if name == "a" else f"{name}/{name}.sock")
+        )  # by hand; a service
+        self.status = StatusServer(own, self.bridge.snapshot)
+        self.neighbours = Neighbours(own)
         self.bridge.start()
 
     def turn(self, readable: list[object]) -> None:

@@ -10,6 +10,7 @@ import select
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -310,14 +311,19 @@ class TestChoice:
 
 
 class TestErrors:
-    def test_no_permission(self, chip: Chip, machine: Path) -> None:
+    @pytest.mark.parametrize("group", ["plugdev", "can-bridge"])
+    def test_no_permission(
+        self, chip: Chip, machine: Path, monkeypatch: pytest.MonkeyPatch, group: str
+    ) -> None:
+        """The group of the service, where that is installed."""
+        groups = {"can-bridge": SimpleNamespace(gr_name="can-bridge")} if group == "can-bridge" else {}
+        monkeypatch.setattr(ports.grp, "getgrnam", groups.__getitem__)
         chip.refuse["open"] = errno.EACCES
         with pytest.raises(NotPermittedError) as caught:
             open_port(URL, 57600)
         text = str(caught.value)
-        rule = (
-            'SUBSYSTEM=="usb", ATTR{idVendor}=="0403", ATTR{idProduct}=="6001", MODE="0660", GROUP="plugdev"'
-        )
+        attributes = 'ATTR{idVendor}=="0403", ATTR{idProduct}=="6001"'
+        rule = f'SUBSYSTEM=="usb", {attributes}, MODE="0660", GROUP="{group}"'
         for part in (f"{machine}/dev/bus/usb/001/004", rule, "/etc/udev/rules.d/70-can-bridge.rules"):
             assert part in text
         assert "udevadm control --reload && udevadm trigger" in text

@@ -42,6 +42,29 @@ class TestServer:
             StatusServer(path, dict)
         assert path.read_text() == "mine"
 
+    @pytest.mark.parametrize(("first", "second"), [("a.sock", "a/a.sock"), ("a/a.sock", "a.sock")])
+    def test_the_service_and_one_by_hand_are_two_of_a_name(
+        self, tmp_path: Path, first: str, second: str
+    ) -> None:
+        with serving(tmp_path / first, {"counters": {}}):
+            with pytest.raises(
+                StatusError, match=f"'a' is running already .it answers on {tmp_path}/{first}"
+            ):
+                StatusServer(tmp_path / second, dict)
+            StatusServer(tmp_path / "b.sock", dict).close()
+        with socket.socket(socket.AF_UNIX) as dead:
+            dead.bind(str(tmp_path / first))
+        StatusServer(tmp_path / second, dict).close()
+
+    def test_a_sandbox_that_knows_no_group_is_not_asked(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def refused(_group: int) -> None:
+            raise PermissionError
+
+        monkeypatch.setattr(os, "setegid", refused)
+        StatusServer(tmp_path / "a.sock", dict).close()
+
     def test_for_owner_and_group_whatever_the_umask(self, tmp_path: Path) -> None:
         before = os.umask(0)
         try:
