@@ -129,6 +129,8 @@ class Relay:
         takes them, at most `depth` at once in the device. `retries`: a refused frame is sent again.
         `long_stamps`: received frames may have time stamps of 8 digits.
         """
+    def count_late(self, kept: int, /) -> None:
+        """The last `kept` frames given to the device may leave it late: counts them, none twice."""
     def set_level_window(
         self, ask: bytes, prefix: bytes, /, *, capacity: int, critical: int, ready: int
     ) -> None:

@@ -105,6 +105,7 @@ class Sending(NamedTuple):
     long_stamps: bool = False  # received frames may have time stamps of 8 digits
     probation: int | None = None  # frames that it gets after its buffer was stuck, until one is seen to leave
     keeps_buffer: bool = False  # closing the channel does not empty the buffer
+    kept: int = 0  # how many frames such a buffer has room for
 
 
 class Identity(NamedTuple):

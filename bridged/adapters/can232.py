@@ -255,6 +255,8 @@ class Can232:
             self.cautions += (profile.listen_only_warning,)
         self.sync = self._ask_version(found.version_prefix)
         self.sending = profile.sending
+        if self.sending.keeps_buffer:
+            self.sending = self.sending._replace(kept=profile.buffer)
         if profile.paced:
             self.sending = self.sending._replace(paced_bitrate=self._channel.timing.bitrate)
         self._refuse_unfit(profile)

@@ -315,6 +315,12 @@ class Bridge:
             if self.state not in COMING_UP:
                 self._hand_over.adapter_is_decided()
 
+    def _stuck(self, verdict: Verdict | None) -> Verdict | None:
+        """Counts the frames that stay in the adapter, where it keeps its buffer."""
+        if verdict is not None:
+            self._loop.relay.count_late(self.adapter.sending.kept)
+        return verdict
+
     def _decide(self, found: Found) -> Verdict | None:
         """The event that the news are in the present state; tells the interface what concerns it."""
         if isinstance(found, Finding):
@@ -324,7 +330,7 @@ class Bridge:
                 return Verdict(Event.SILENT, found.failure)
             if not found.bus_off or self.state is not State.RUNNING:
                 return None
-            found = self._recovery.bus_off(found.bus_off)
+            found = self._stuck(self._recovery.bus_off(found.bus_off))
         if found is not None and found.off_bus:
             for frame in self._polling.taken_off().error_frames:
                 self._interface.put_error_frame(frame)
@@ -422,7 +428,9 @@ class Bridge:
         if kind == _relay.EVENT_SILENT:
             return Verdict(Event.SILENT, "the adapter stopped answering")
         if kind == _relay.EVENT_STUCK:
-            return self._recovery.stuck(token, self._polling) if self.state is State.RUNNING else None
+            if self.state is not State.RUNNING:
+                return None
+            return self._stuck(self._recovery.stuck(token, self._polling))
         if kind == _relay.EVENT_UNASKED:
             return self._polling.heard(text)
         now = time.monotonic()

@@ -8,6 +8,7 @@ for when a frame counts as sent (all but type and port None: not known)}, bus {i
 up: it is open and carries frames},
 counters {rx_frames: frames put on the interface; tx_frames: frames the adapter vouches for; tx_queued: frames
 of which it says no more than that they are in its buffer; tx_unconfirmed: frames of which it says nothing;
+tx_late: of all these, those that may leave its buffer late;
 rx_errors: pieces of noise from the adapter; tx_retries: frames sent once more; tx_returned: frames the
 adapter handed back; tx_stops, rx_overruns: how often it said "stop", "I lost frames"; reconnects: how often
 it ran again; bus_off_restarts; tx_full, rx_overflow, arbitration_lost, bus_error: how often it said so (those

@@ -95,9 +95,8 @@ def _farewell(status: dict[str, Any]) -> list[str]:
 
 def _given(counters: dict[str, Any], frames: str = " frames") -> str:
     """How many: `8 frames`; `8 frames, 3 queued, 2 unconfirmed` where the adapter does not vouch for all."""
-    others = [
-        f"{counters[f'tx_{name}']} {name}" for name in ("queued", "unconfirmed") if counters[f"tx_{name}"]
-    ]
+    apart = {"tx_queued": "queued", "tx_unconfirmed": "unconfirmed", "tx_late": "of these perhaps late"}
+    others = [f"{counters[key]} {what}" for key, what in apart.items() if counters[key]]
     return ", ".join([f"{counters['tx_frames']}{frames}", *others])
 
 

@@ -62,6 +62,7 @@
     X(confirmed, "tx_frames", "frames that the adapter put on its bus, or into a buffer that closing empties") \
     X(buffered, "tx_queued", "frames that are in the adapter's buffer, or were: it does not tell") \
     X(unconfirmed, "tx_unconfirmed", "frames given to an adapter that says nothing of what became of them") \
+    X(late, "tx_late", "of these, frames that may leave late: from a stuck buffer that closing does not empty") \
     X(retries, "tx_retries", "frames sent once more after a refusal") \
     X(returned, "tx_returned", "frames that the adapter handed back") \
     X(stops, "tx_stops", "how often the adapter said that its transmit buffer is nearly full") \

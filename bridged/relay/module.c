@@ -405,6 +405,15 @@ static PyObject *Relay_set_sending(PyObject *self, PyObject *args, PyObject *kwa
     Py_RETURN_NONE;
 }
 
+static PyObject *Relay_count_late(PyObject *self, PyObject *arg)
+{
+    uint32_t kept;
+    if (!uint32_from(arg, &kept))
+        return NULL;
+    relay_count_late(self_relay(self), kept);
+    Py_RETURN_NONE;
+}
+
 static PyObject *Relay_set_level_window(PyObject *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"ask", "prefix", "capacity", "critical", "ready", NULL};
@@ -527,6 +536,7 @@ static PyMethodDef RELAY_METHODS[] = {
     {"set_sync", Relay_set_sync, METH_VARARGS, NULL},
     {"set_polling", Relay_set_polling, METH_VARARGS, NULL},
     {"set_sending", (PyCFunction)(void (*)(void))Relay_set_sending, METH_VARARGS | METH_KEYWORDS, NULL},
+    {"count_late", Relay_count_late, METH_O, NULL},
     {"set_level_window", (PyCFunction)(void (*)(void))Relay_set_level_window, METH_VARARGS | METH_KEYWORDS, NULL},
     {"command", (PyCFunction)(void (*)(void))Relay_command, METH_VARARGS | METH_KEYWORDS, NULL},
     {"events", Relay_events, METH_NOARGS, NULL},

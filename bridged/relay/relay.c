@@ -34,6 +34,7 @@ struct relay {
     int port, interface; /* our own, -1: none */
     bool port_full;      /* epoll_fd waits for room in the port, too */
     bool held;           /* the interface is not read */
+    uint64_t late_looked; /* frames given to devices when those that may be late were counted last */
     uint32_t attachments; /* counts attach and detach: results of a wait before one are void */
 
     struct counters counters;
@@ -313,6 +314,18 @@ void relay_set_sending(struct relay *r, const struct sending_settings *set)
     transmit_set_sending(&r->transmit, set);
     receive_set_stamps(&r->receive, set->long_stamps);
     unlock_wake(r);
+}
+
+/* No frame leaves the device, and its buffer, of `kept` frames, outlives what is done about that. Those in it are the
+ * last that it got; none is counted twice. */
+void relay_count_late(struct relay *r, uint32_t kept)
+{
+    lock(r);
+    const uint64_t given = r->counters.confirmed + r->counters.buffered + r->counters.unconfirmed;
+    const uint64_t fresh = given - r->late_looked;
+    r->counters.late += fresh < kept ? fresh : kept;
+    r->late_looked = given;
+    unlock(r);
 }
 
 void relay_set_level_window(struct relay *r, const struct level_settings *set)

@@ -48,6 +48,7 @@ int relay_set_queue(struct relay *r, const struct queue_settings *set); /* -> 0 
 void relay_set_sync(struct relay *r, const struct command *sync);
 void relay_set_polling(struct relay *r, const struct command *poll, int64_t interval_ns);
 void relay_set_sending(struct relay *r, const struct sending_settings *set);
+void relay_count_late(struct relay *r, uint32_t kept);
 void relay_set_level_window(struct relay *r, const struct level_settings *set);
 void relay_command(struct relay *r, const struct command *command, bool more);
 

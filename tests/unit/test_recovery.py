@@ -121,6 +121,19 @@ def test_a_can232_with_a_few_frames_that_nobody_acknowledges_is_restarted(can232
     heals(can232, bridge, device, [0.0])
 
 
+def test_what_stays_in_a_stuck_adapter_is_counted(can232: Bench) -> None:
+    """Where closing the channel does not empty its buffer."""
+    device = Can232(time.monotonic())
+    can232.plug_in(device)
+    bridge = started(can232.bridge(transmit=TRANSMIT))
+    bridge.adapter.sending = bridge.adapter.sending._replace(kept=8)
+    device.set_bus_off(time.monotonic(), True)
+    send(can232, OLD, 3)
+    run_until(bridge, lambda: bridge.state is not State.RUNNING)
+    assert bridge.snapshot()["counters"]["tx_late"] == 3
+    stopped(bridge)
+
+
 @pytest.mark.parametrize("event", [Event.RESTART, Event.STOP])
 def test_a_can232_that_is_never_to_be_restarted_stays_off_the_bus(
     can232: Bench, event: Event, caplog: pytest.LogCaptureFixture

@@ -248,3 +248,17 @@ class TestAnswersThatComeLater:
         assert rig.events() == [(_relay.EVENT_OK, 8, b"")]
         counters = rig.counters()
         assert (counters["unanswered"], counters["tx_frames"], counters["resyncs"]) == (3, 0, 0)
+
+
+def test_frames_that_may_be_late_are_the_last_ones_and_counted_once(rig: Rig) -> None:
+    late = []
+    for taken in (5, 0, 1, 3, 9):
+        for number in range(taken):
+            rig.bus.send(can_frame(number))
+            rig.turn()
+            rig.port.send(b"z\r")
+            rig.turn()
+        rig.relay.count_late(3)
+        rig.attach()
+        late.append(rig.counters()["tx_late"])
+    assert late == [3, 3, 4, 7, 10]

@@ -244,9 +244,12 @@ class TestText:
         ]
 
     def test_what_the_adapter_does_not_vouch_for_is_named_apart(self) -> None:
-        counters = snapshot()["counters"] | {"tx_frames": 1, "tx_queued": 7, "tx_unconfirmed": 2}
-        text = render(snapshot(counters=counters))
-        assert "  sent        1 frames, 7 queued, 2 unconfirmed to the adapter, 42/s," in text
+        apart = {"tx_frames": 1, "tx_queued": 7, "tx_unconfirmed": 2, "tx_late": 3}
+        text = render(snapshot(counters=snapshot()["counters"] | apart))
+        sent = (
+            "  sent        1 frames, 7 queued, 2 unconfirmed, 3 of these perhaps late to the adapter, 42/s,"
+        )
+        assert sent in text
         assert "sent means" in text
         adapter = snapshot()["adapter"] | {"sent_means": None}
         assert "sent means" not in render(snapshot(adapter=adapter))

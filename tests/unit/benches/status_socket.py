@@ -20,6 +20,7 @@ def snapshot(name: str = "can232", **changes: Any) -> dict[str, Any]:
         "tx_frames": 84,
         "tx_queued": 0,
         "tx_unconfirmed": 0,
+        "tx_late": 0,
         "rx_errors": 0,
         "rx_overruns": 0,
         "tx_retries": 1,
