@@ -512,6 +512,13 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         help="again each second, until Ctrl-C; a bridge that does not run is waited for",
     )
 
+    listing = add(
+        "list",
+        "List the serial ports and USB devices that could be an adapter; opens none of them.",
+        _list,
+    )
+    listing.add_argument("--json", action="store_true", help="print JSON, for programs: a list of objects")
+
     simulate = add(
         "simulate", "Simulate an adapter on a pseudo terminal, or on an existing device or socket.", _simulate
     )
@@ -530,6 +537,12 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
 
         add_demo(demo)
     return parser
+
+
+def _list(args: argparse.Namespace) -> int:
+    from bridged import listing  # noqa: PLC0415
+
+    return listing.run(args)
 
 
 def _simulate(args: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import grp
 import os
 import pwd
@@ -12,6 +13,8 @@ from typing import Final
 _PROC: Final = Path("/proc")
 _CONTAINER_MARKS: Final = (Path("/run/.containerenv"), Path("/.dockerenv"))  # of podman, of docker
 
+_RULES: Final = "/etc/udev/rules.d/70-can-bridge.rules"
+_GROUP: Final = "can-bridge"  # of systemd/can-bridge.sysusers, which the udev rules name
 _NO_SUCH_GROUP: Final = 65_534  # how a group is shown that the user namespace has not
 
 
@@ -38,6 +41,25 @@ def explain_refused(node: Path) -> str:
     service = ", and DeviceAllow= of the service" if _in_service() else ", or be root"
     advice = f"check the udev rule that gives it to a group{service}"
     return f"user {user_name()} has no permission ({owner}): {advice}"
+
+
+def explain_refused_usb(node: Path, vendor: int, product: int) -> str:
+    """EACCES for the node of a USB device itself, not of its tty."""
+    with contextlib.suppress(OSError):  # just unplugged
+        if missing := explain_missing_group(node.stat()):
+            return f"{node}: {missing}"
+    user = user_name()
+    attributes = f'ATTR{{idVendor}}=="{vendor:04x}", ATTR{{idProduct}}=="{product:04x}"'
+    try:
+        group = grp.getgrnam(_GROUP).gr_name
+    except KeyError:
+        group = "plugdev"
+    rule = f'SUBSYSTEM=="usb", {attributes}, MODE="0660", GROUP="{group}"'
+    return (
+        f"user {user} has no permission for {node}: put the line {rule} into {_RULES}, run "
+        "`udevadm control --reload && udevadm trigger --subsystem-match=usb`, "
+        f"and see to it that {user} is in group {group}"
+    )
 
 
 def explain_missing_group(status: os.stat_result) -> str:

@@ -38,7 +38,7 @@ def usb_ttys() -> dict[UsbTty, str]:
     found = {}
     for link in (_SYS / "class/tty").glob("tty[A-Z]*"):
         directory = link.resolve()
-        device = _usb_device(directory)
+        device = usb_device(directory)
         if device is None:
             continue
         inner = directory.relative_to(device).parts[0]  # 1-1:1.0 is configuration 1, interface 0
@@ -68,15 +68,20 @@ def product(directory: Path) -> str | None:
     return _usb_text(directory, "product")
 
 
+def manufacturer(directory: Path) -> str | None:
+    """Who made the USB device that `directory` belongs to, as it says; None: it does not, or is not USB."""
+    return _usb_text(directory, "manufacturer")
+
+
 def _usb_text(directory: Path, name: str) -> str | None:
-    device = _usb_device(directory)
+    device = usb_device(directory)
     if device is not None:
         with contextlib.suppress(OSError):
             return printable((device / name).read_text(errors="replace").strip()) or None
     return None
 
 
-def _usb_device(directory: Path) -> Path | None:
+def usb_device(directory: Path) -> Path | None:
     """The directory of the USB device that `directory` belongs to; further up are hubs."""
     return next((path for path in (directory, *directory.parents) if (path / "idVendor").exists()), None)
 

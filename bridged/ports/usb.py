@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
-import grp
 import os
 import socket
 from pathlib import Path
@@ -21,7 +20,7 @@ from usb.core import USBError, USBTimeoutError
 
 from bridged.errors import NotPermittedError, PortError
 from bridged.ports import sysfs
-from bridged.ports.permission import explain_forbidden, explain_missing_group, user_name
+from bridged.ports.permission import explain_forbidden, explain_refused_usb
 from bridged.ports.pump import POLL_INTERVAL_S, Pump
 from bridged.text import printable
 
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 
 _DEV: Final = Path("/dev")
 _LIBUSB: Final = "libusb-1.0.so.0"
-_RULES: Final = "/etc/udev/rules.d/70-can-bridge.rules"
 
 _POLL_INTERVAL_MS: Final = round(POLL_INTERVAL_S * 1000)
 _BLOCK: Final = 4096
@@ -266,7 +264,7 @@ def _explain(device: Any, error: USBError) -> str:
     node = _node(device)
     match error.errno:
         case errno.EACCES:
-            return _explain_refused(device, node)
+            return explain_refused_usb(node, device.idVendor, device.idProduct)
         case errno.EBUSY:
             ourselves = f"(process {os.getpid()})"
             users = [user for user in sysfs.users(node) if not user.endswith(ourselves)]
@@ -279,26 +277,6 @@ def _explain(device: Any, error: USBError) -> str:
             return explain_forbidden(node)
         case _:
             return f"cannot be opened: {error.strerror}"
-
-
-def _explain_refused(device: Any, node: Path) -> str:
-    with contextlib.suppress(OSError):  # just unplugged
-        if missing := explain_missing_group(node.stat()):
-            return f"{node}: {missing}"
-    user = user_name()
-    attributes = f'ATTR{{idVendor}}=="{device.idVendor:04x}", ATTR{{idProduct}}=="{device.idProduct:04x}"'
-    try:
-        group = grp.getgrnam(
-            "can-bridge"
-        ).gr_name  # of systemd/can-bridge.sysusers, which its udev rules name
-    except KeyError:
-        group = "plugdev"
-    rule = f'SUBSYSTEM=="usb", {attributes}, MODE="0660", GROUP="{group}"'
-    return (
-        f"user {user} has no permission for {node}: put the line {rule} into {_RULES}, run "
-        "`udevadm control --reload && udevadm trigger --subsystem-match=usb`, "
-        f"and see to it that {user} is in group {group}"
-    )
 
 
 def _why_lost(error: USBError) -> str:

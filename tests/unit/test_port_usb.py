@@ -19,7 +19,7 @@ from benches.fake_libusb import Chip, FakeLibusb, usb_error
 from usb.core import USBError
 
 from bridged.errors import NotPermittedError, PortError
-from bridged.ports import open_port, sysfs
+from bridged.ports import open_port, permission, sysfs
 from bridged.ports import usb as ports
 from bridged.ports.usb import strip_status
 
@@ -317,7 +317,7 @@ class TestErrors:
     ) -> None:
         """The group of the service, where that is installed."""
         groups = {"can-bridge": SimpleNamespace(gr_name="can-bridge")} if group == "can-bridge" else {}
-        monkeypatch.setattr(ports.grp, "getgrnam", groups.__getitem__)
+        monkeypatch.setattr(permission.grp, "getgrnam", groups.__getitem__)
         chip.refuse["open"] = errno.EACCES
         with pytest.raises(NotPermittedError) as caught:
             open_port(URL, 57600)
