@@ -23,6 +23,7 @@ cache=${CAN_BRIDGE_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/can-bridge}
 work=$cache/containers
 suite=bookworm
 base=docker.io/library/debian:$suite-slim
+keep=6            # of what was built
 store_max_mb=4000 # layers of earlier builds; then everything is built anew
 
 # Of what is copied into the image, whatever git makes of it.
@@ -101,16 +102,17 @@ build() {
     rm -rf "$new/store"
 }
 
-# Rename, so that nobody ever sees half of it; who comes second throws his own away.
+# Rename, so that nobody ever sees half of it; who comes second throws his own away. Other clones of the repository have
+# other images, and may be using them.
 publish() {
     chmod 755 "$new"
     mv -T "$new" "$out" 2>/dev/null || [ -s "$out/store.ext4" ] || die "cannot write $out"
-    for old in "$cache"/image-*; do
-        [ "$old" = "$out" ] || rm -rf "$old"
-    done
-    # Not removed: their layers are what the next build begins with.
-    for old in $(in_podman images --format '{{.Repository}}:{{.Tag}}' | grep '^localhost/can-'); do
-        case $old in *":$key" | *:latest) ;; *) in_podman untag "$old" ;; esac
+    # shellcheck disable=SC2012  # our own names, by age
+    ls -dt "$cache"/image-* | tail -n +$((keep + 1)) | while read -r old; do
+        rm -rf "$old"
+        # Not removed: their layers are what the next build begins with.
+        in_podman untag "localhost/can-bridge:${old##*-}" || true
+        in_podman untag "localhost/can-utils:${old##*-}" || true
     done
 }
 
@@ -130,7 +132,7 @@ if [ "${1:-}" = --podman ]; then
     exit
 fi
 [ $# = 0 ] || die "usage: image.sh [--where | --tag | --podman ARGUMENT…]"
-[ -s "$out/store.ext4" ] && exit 0
+if [ -s "$out/store.ext4" ] && in_podman image exists "localhost/can-bridge:$key"; then exit 0; fi
 
 for tool in buildah podman crun mmdebstrap mke2fs unshare; do
     command -v "$tool" >/dev/null || die "the images cannot be built here: $tool is missing"

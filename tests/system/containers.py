@@ -25,7 +25,7 @@ from typing import Any
 
 import pytest
 import yaml
-from rig import DEADLINE_S, MONITOR, wait_until
+from rig import DEADLINE_S, MONITOR, Place, wait_until
 
 DISK = Path("/dev/vdb")
 IMAGES = Path("/run/container-images")
@@ -105,19 +105,15 @@ class Container:
         asked = ("exec", self.identity, "can-bridge", "status", "--check", probe)
         wait_until(lambda: f": {probe}, " in podman(*asked, check=False), f"{probe} of {self}", deadline_s)
 
-    def kill(self) -> None:
-        """SIGKILL."""
-        podman("kill", "--signal", "KILL", self.identity)
+    def exit_status(self) -> int:
+        """Once it has ended."""
         wait_until(lambda: not self.is_running, f"the end of {self}")
-
-    def restart(self) -> None:
-        """The same container once more."""
-        podman("start", self.identity)
+        return int(self._state("ExitCode"))
 
     def stop(self) -> int:
         """SIGTERM, and after 10 s SIGKILL; the exit status."""
         podman("stop", "--time", "10", self.identity)
-        return int(self._state("ExitCode"))
+        return self.exit_status()
 
     def __str__(self) -> str:
         return f"container {self.identity[:12]}:\n{self.logs[-3000:]}"
@@ -130,6 +126,8 @@ class Containers:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
+        for path in (directory, *directory.parents[:2]):  # pytest's are for root only
+            path.chmod(0o755)
         self._pods: list[str] = []
         self._made: list[Container] = []
 
@@ -145,15 +143,27 @@ class Containers:
         directory = self.directory / f"etc{next(self._numbers)}"
         directory.mkdir()
         (directory / "can-bridge.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
-        for path in (directory, *directory.parents[:3]):  # pytest's are for root only
-            path.chmod(0o755)
         return "--volume", f"{directory}:/etc/can-bridge:ro"
+
+    def application(self, pod: str) -> Place:
+        """For can-utils: each command in a container of its own, in this pod."""
+        infrastructure = podman("pod", "inspect", "--format", "{{.InfraContainerID}}", pod)
+        here = ("--volume", f"{self.directory}:{self.directory}:ro")  # canplayer's file
+        return Place(
+            ("podman", "run", "--rm", "--pod", pod, *UNPRIVILEGED, *here, "can-utils"),
+            Container(infrastructure).pid,
+        )
 
     def start(self, *arguments: str | Path) -> Container:
         """`podman run -d`: options, image, command."""
         container = Container(podman("run", "--detach", *arguments).splitlines()[-1])
         self._made.append(container)
         return container
+
+    def play(self, manifest: Path, pod: str) -> None:
+        """`podman play kube` without any network; `pod` is the name of the pod in it."""
+        self._pods.append(pod)
+        podman("play", "kube", "--network", "none", manifest)
 
     def once(self, *arguments: str | Path) -> str:
         """`podman run --rm`, which must succeed: options, image, command; its output."""
@@ -165,4 +175,4 @@ class Containers:
             print(container)
             podman("rm", "--force", "--volumes", "--time", "0", container.identity)
         for pod in self._pods:
-            podman("pod", "rm", "--force", pod)
+            podman("pod", "rm", "--force", "--ignore", pod)

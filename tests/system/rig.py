@@ -46,9 +46,12 @@ def wait_until(condition: Callable[[], T], what: str, deadline_s: float = DEADLI
         time.sleep(0.02)
 
 
-def receivers(interface: str) -> int:
-    """Count the filters by which sockets receive from the interface: zero until somebody listens."""
-    lists = Path("/proc/net/can").glob("rcvlist_*")
+def receivers(interface: str, process: int | None = None) -> int:
+    """Count the filters by which sockets receive from the interface: zero until somebody listens.
+
+    The interface is in the network namespace of `process`, or in ours.
+    """
+    lists = Path("/proc", str(process or "self"), "net/can").glob("rcvlist_*")
     return sum(line.split()[:1] == [interface] for path in lists for line in path.read_text().splitlines())
 
 
@@ -143,14 +146,24 @@ class Process:
         )
 
 
+class Place(NamedTuple):
+    """Where can-utils run: here, or in the network namespace of a process, by a command before theirs."""
+
+    prefix: Sequence[str] = ()
+    process: int | None = None
+
+
+HERE = Place()
+
+
 class Candump(Process):
     """A candump that listens already when it is made, with room for all that comes."""
 
-    def __init__(self, interface: str, log: Path, *, errors: bool = False) -> None:
-        before = receivers(interface)
+    def __init__(self, interface: str, log: Path, *, errors: bool = False, place: Place = HERE) -> None:
+        before = receivers(interface, place.process)
         source = f"{interface},0:0,#FFFFFFFF" if errors else interface
-        super().__init__(["candump", "-L", "-d", "-r", str(SOCKET_BUFFER), source], log)
-        self.wait_ready(lambda: receivers(interface) > before, "candump to listen")
+        super().__init__([*place.prefix, "candump", "-L", "-d", "-r", str(SOCKET_BUFFER), source], log)
+        self.wait_ready(lambda: receivers(interface, place.process) > before, "candump to listen")
 
     @property
     def count(self) -> int:
@@ -412,9 +425,9 @@ class Rig:
         self._processes.append(process)
         return process
 
-    def candump(self, interface: str, *, errors: bool = False) -> Candump:
+    def candump(self, interface: str, *, errors: bool = False, place: Place = HERE) -> Candump:
         """A log of what appears on the interface from now on; with ``errors`` error frames too."""
-        dump = Candump(interface, self._log(f"candump-{interface}"), errors=errors)
+        dump = Candump(interface, self._log(f"candump-{interface}"), errors=errors, place=place)
         self._processes.append(dump)
         return dump
 
@@ -422,11 +435,17 @@ class Rig:
         """One frame."""
         subprocess.run(["cansend", interface, frame], check=True, timeout=DEADLINE_S)
 
-    def cangen(self, interface: str, count: int, *options: str, gap_ms: float = 0) -> Process:
+    def cangen(
+        self, interface: str, count: int, *options: str, gap_ms: float = 0, place: Place = HERE
+    ) -> Process:
         """Generate frames, see cangen's options; it waits for room where the interface has a queue."""
-        return self.start("cangen", interface, "-g", str(gap_ms), "-n", str(count), "-p", "100", *options)
+        return self.start(
+            *place.prefix, "cangen", interface, "-g", str(gap_ms), "-n", str(count), "-p", "100", *options
+        )
 
-    def play(self, interface: str, frames: Sequence[str], rate: float | None = None) -> Process:
+    def play(
+        self, interface: str, frames: Sequence[str], rate: float | None = None, *, place: Place = HERE
+    ) -> Process:
         """Send exactly these frames: as fast as it goes, or ``rate`` of them a second."""
         log = self._log("play").with_suffix(".log")
         step = 1 / rate if rate else 0.0
@@ -434,7 +453,7 @@ class Rig:
         pace = ["-g", "1"] if rate else ["-t"]
         # On one processor: while softirqs are behind, frames of a sender that moves to another change places.
         processor = str(min(os.sched_getaffinity(0)))
-        return self.start("taskset", "-c", processor, "canplayer", "-I", log, *pace)
+        return self.start(*place.prefix, "taskset", "-c", processor, "canplayer", "-I", log, *pace)
 
     def slcanpty(self, interface: str) -> tuple[Process, Path]:
         """can-utils' slcan adapter on a pseudo-terminal: the process, and the terminal a bridge opens."""
