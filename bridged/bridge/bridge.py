@@ -271,6 +271,7 @@ class Bridge:
             "adapter": {
                 "type": self.config.adapter.type,
                 "port": self.config.adapter.port,
+                "opened": self._port.port.description if self._port.port else None,
                 **adapter.identity._asdict(),
                 "sent_means": adapter.sent_means,
             },

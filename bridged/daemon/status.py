@@ -3,9 +3,9 @@
 version (of can-bridge), name, state, reason, channel_open (None: the adapter was never asked; true also where
 it did not say), bus_state, tec, rec (None: not known), rates {rx_fps, tx_fps: frames a second},
 answer_time_ms {min, median, max: of the adapter's last answers to questions about its CAN bus},
-adapter {type, port, version, serial_number, firmware: the name of its profile, sent_means: what it vouches
-for when a frame counts as sent (all but type and port None: not known)}, bus {interface, channel, open,
-up: it is open and carries frames},
+adapter {type, port, opened: what that is now, as /dev/ttyUSB1 (None: it is not open), version, serial_number,
+firmware: the name of its profile, sent_means: what it vouches for when a frame counts as sent (None: not
+known)}, bus {interface, channel, open, up: it is open and carries frames},
 counters {rx_frames: frames put on the interface; tx_frames: frames the adapter vouches for; tx_queued: frames
 of which it says no more than that they are in its buffer; tx_unconfirmed: frames of which it says nothing;
 tx_late: of all these, those that may leave its buffer late;

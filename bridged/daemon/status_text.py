@@ -45,8 +45,11 @@ def _lines(status: dict[str, Any]) -> list[str]:
     identity = f"version {adapter['version'] or '?'}, serial number {adapter['serial_number'] or '?'}"
     if adapter["firmware"]:
         identity += f", firmware {adapter['firmware']}"
+    place = adapter["port"]
+    if adapter["opened"] not in {None, place}:
+        place += f" ({adapter['opened']})"
     parts = {
-        "adapter": f"{adapter['type']} on {adapter['port']}, {identity}",
+        "adapter": f"{adapter['type']} on {place}, {identity}",
         "CAN bus": _bus_state(status),
         "interface": f"{bus['interface']} {bus['channel']}{'' if bus['open'] else ', NOT OPEN'}",
         "received": (

@@ -78,6 +78,7 @@ def test_frames_both_ways_and_closed_at_the_end(bench: Bench) -> None:
     assert status["adapter"] | {"port": ""} == {
         "type": "can232",
         "port": "",
+        "opened": None,
         "version": "V1324",
         "serial_number": "A123",
         "firmware": "can232",

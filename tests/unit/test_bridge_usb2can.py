@@ -84,6 +84,7 @@ def test_frames_both_ways_are_exact_and_it_is_closed_at_the_end(bench: Usb2canBe
     assert status["adapter"] | {"port": ""} == {
         "type": "usb2can",
         "port": "",
+        "opened": None,
         "version": version,
         "serial_number": None,
         "firmware": None,

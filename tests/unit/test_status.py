@@ -254,6 +254,12 @@ class TestText:
         adapter = snapshot()["adapter"] | {"sent_means": None}
         assert "sent means" not in render(snapshot(adapter=adapter))
 
+    def test_a_port_is_named_with_what_it_is_now(self) -> None:
+        adapter = snapshot()["adapter"] | {"port": "usb-serial://A6008isP", "opened": "/dev/ttyUSB3"}
+        assert "can232 on usb-serial://A6008isP (/dev/ttyUSB3), version" in render(snapshot(adapter=adapter))
+        adapter["opened"] = None
+        assert "can232 on usb-serial://A6008isP, version" in render(snapshot(adapter=adapter))
+
     def test_what_is_not_known(self) -> None:
         bus = snapshot()["bus"] | {"open": False}
         lines = render(

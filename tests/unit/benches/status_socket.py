@@ -42,6 +42,7 @@ def snapshot(name: str = "can232", **changes: Any) -> dict[str, Any]:
             "port": "/dev/ttyUSB0",
             "version": "V1010",
             "serial_number": "A123",
+            "opened": "/dev/ttyUSB0",
             "firmware": "can232",
             "sent_means": "sent means taken",
         },
