@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 import pytest
-from benches.paced import S, Silent, bits_of
+from benches.paced import Queued, S, Silent, bits_of
 from benches.relay import FRAME, MS, Rig, can_frame, rig_with
 from hypothesis import given
 from hypothesis import strategies as st
@@ -75,6 +75,30 @@ def test_no_frame_is_lost_in_the_device_and_the_bus_is_used(bitrate: int, load: 
         if not load:
             bus_ns = sum(bits_of(frame) for frame in rig.sent) * S / bitrate
             assert rig.busy_ns - begin < 1.02 * bus_ns + 3 * LATENCY_NS
+
+
+@pytest.mark.parametrize("load", [0.0, 0.3])
+def test_a_device_on_usb_that_answers_each_frame_gets_3000_a_second(load: float) -> None:
+    """Nakakiyo, Elmue: 64 in their buffer, 1 ms each way. All arrive, in order, and none is ever refused."""
+    frames, bitrate = 3000, 1_000_000
+    sending = Sending(Confirms.QUEUED, window=32, paced_bitrate=bitrate, depth=56)
+    rig = Queued(sending=sending, bitrate=bitrate, room=64, slow=0.005, link_ns=1 * MS)
+    try:
+        begin = rig.now
+        other = FRAME.pack(0x055, 8, bytes(8))
+        between_ns = bits_of(other) * S / bitrate / load if load else 0
+        rig.others.extend(
+            (begin + int(i * between_ns), other) for i in range(int(S / between_ns) if load else 0)
+        )
+        for number in range(frames):
+            rig.bus.send(can_frame(number))
+            rig.turn_and_link()
+        rig.run(begin + S)
+        counters = rig.counters()
+        assert rig.sent == [can_frame(number) for number in range(frames)]
+        assert (counters["tx_queued"], counters["tx_retries"], rig.lost) == (frames, 0, 0)
+    finally:
+        rig.close()
 
 
 def test_the_loop_wakes_for_several_frames_at_once() -> None:

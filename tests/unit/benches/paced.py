@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import deque
+from typing import Any
 
 from benches.relay import EFF_FLAG, FRAME, Rig
 from bridged.adapters.base import Confirms, Sending
@@ -53,6 +54,7 @@ class Silent(Rig):
         self.room, self.link_ns = room, link_ns
         self.random = random.Random(seed)
         self.under_way: deque[tuple[int, bytes]] = deque()  # when it reaches the device
+        self.up: deque[tuple[int, bytes]] = deque()  # when an answer reaches the host
         self.waiting: deque[bytes] = deque()
         self.sent: list[bytes] = []
         self.lost = 0
@@ -65,6 +67,8 @@ class Silent(Rig):
         due = self.turn_and_link()
         while True:
             times = [until] if due is None else [until, due]
+            if self.up:
+                times.append(self.up[0][0])
             if self.under_way:
                 times.append(self.under_way[0][0])
             if self.waiting:
@@ -91,12 +95,16 @@ class Silent(Rig):
         self.under_way.append((arrives, line))
 
     def _device(self) -> None:
+        while self.up and self.up[0][0] <= self.now:
+            self.port.send(self.up.popleft()[1])
         while self.under_way and self.under_way[0][0] <= self.now:
             _, line = self.under_way.popleft()
             if len(self.waiting) == self.room:
                 self.lost += 1
+                self._answer(b"\a")
             else:
                 self.waiting.append(line)
+                self._answer(b"Z\r" if line[:1] in b"TR" else b"z\r")
         while self.busy_ns <= self.now and (self.waiting or self._other_is_due()):
             if self._other_is_due():  # of a higher priority
                 frame = self.others.popleft()[1]
@@ -106,8 +114,28 @@ class Silent(Rig):
                 self.sent.append(frame)
             self.busy_ns = self.now + bits_of(frame) * self.bit_ns
 
+    def _answer(self, answer: bytes) -> None:
+        """It says nothing."""
+
     def _other_is_due(self) -> bool:
         return bool(self.others) and self.others[0][0] <= self.now
+
+
+class Queued(Silent):
+    """The same, but it answers a frame when it is in its buffer, or has no room there."""
+
+    def __init__(self, *, sending: Sending, **options: Any) -> None:
+        super().__init__(depth=1, **options)
+        set_sending(self.relay, sending)
+
+    def _answer(self, answer: bytes) -> None:
+        self.up.append((self.now + self.link_ns, answer))
+
+    def _link(self, line: bytes) -> None:
+        if line == b"V":  # is the refusal one?
+            self._answer(b"V1013\r")
+        else:
+            super()._link(line)
 
 
 def frame_of(line: bytes) -> bytes:
