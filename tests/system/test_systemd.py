@@ -311,7 +311,9 @@ class TestUnit:
         assert Path(f"/sys/class/net/{can232.interface}/ifindex").read_text() == index
 
     def test_killed(self, can232: Instance) -> None:
+        """Started again by systemd, which has the interface made anew if somebody has deleted it."""
         pid = can232.pid
+        execute("ip", "link", "delete", can232.interface)
         execute("systemctl", "kill", "-s", "KILL", can232.unit)
         can232.wait_for_another(pid)
         assert can232.show("NRestarts") == "1"
