@@ -496,11 +496,13 @@ class Rig:
         chip.wait_tty()
         return chip
 
-    def bridge(self, configuration: dict[str, Any], name: str = "bridge") -> Bridge:
-        """A bridge with this configuration, not waited for."""
+    def bridge(
+        self, configuration: dict[str, Any], name: str = "bridge", within: Sequence[str] = ()
+    ) -> Bridge:
+        """A bridge with this configuration, not waited for; `within`: a command that starts it."""
         file = self.directory / f"{name}.yaml"
         file.write_text(yaml.safe_dump(configuration, sort_keys=False))
-        bridge = Bridge(self.command, file, self.directory / f"{name}.sock", self._log(name))
+        bridge = Bridge([*within, *self.command], file, self.directory / f"{name}.sock", self._log(name))
         self._processes.append(bridge)
         return bridge
 
