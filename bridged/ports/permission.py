@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Final
 
 _PROC: Final = Path("/proc")
+# Podman's file is not in each of its containers: with a read-only root it was missing.
+_CONTAINER_VARIABLES: Final = frozenset({"container", "KUBERNETES_SERVICE_HOST"})
 _CONTAINER_MARKS: Final = (Path("/run/.containerenv"), Path("/.dockerenv"))  # of podman, of docker
 
 _RULES: Final = "/etc/udev/rules.d/70-can-bridge.rules"
@@ -116,7 +118,8 @@ def _driver(major: int) -> str:
 
 
 def in_container() -> bool:
-    return "KUBERNETES_SERVICE_HOST" in os.environ or any(mark.exists() for mark in _CONTAINER_MARKS)
+    named = not _CONTAINER_VARIABLES.isdisjoint(os.environ)
+    return named or any(mark.exists() for mark in _CONTAINER_MARKS)
 
 
 def _in_service() -> bool:

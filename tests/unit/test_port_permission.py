@@ -19,18 +19,18 @@ OTHER_GROUP = 12_345
 def on_a_host(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Wherever the tests run."""
     monkeypatch.setattr(permission, "_CONTAINER_MARKS", (tmp_path / ".containerenv", tmp_path / ".dockerenv"))
-    for name in ("KUBERNETES_SERVICE_HOST", "NOTIFY_SOCKET"):
+    for name in ("KUBERNETES_SERVICE_HOST", "container", "NOTIFY_SOCKET"):
         monkeypatch.delenv(name, raising=False)
 
 
-@pytest.fixture(params=[".containerenv", ".dockerenv", "kubernetes"])
+@pytest.fixture(params=[".containerenv", ".dockerenv", "container", "KUBERNETES_SERVICE_HOST"])
 def container(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Podman may hand systemd's socket in."""
     monkeypatch.setenv("NOTIFY_SOCKET", "/run/notify")
-    if request.param == "kubernetes":
-        monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "10.0.0.1")
-    else:
+    if request.param.startswith("."):
         (tmp_path / request.param).touch()
+    else:
+        monkeypatch.setenv(request.param, "10.0.0.1")
 
 
 def status(gid: int, mode: int = 0o660) -> os.stat_result:
