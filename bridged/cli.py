@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bridged.interfaces.base import OpenInterface
+    from bridged.overlay import Setting
     from bridged.ports import Port
     from bridged.settings import BusConfig, Config
 
@@ -32,8 +33,17 @@ PROBES = ("started", "ready", "live")  # see daemon/probes.py
 CONFIG_DIRECTORY = Path("/etc/can-bridge")
 DEFAULT_NAME = "can-bridge"  # of a configuration
 HELP_WIDTH = 98
+RUN_OPTIONS = {
+    "--socket",
+    "--user",
+    "--verbose",
+    "--capture",
+    "--mask",
+    "--capture-limit",
+}  # all others are keys
 MEGABYTES_MAX = 10_000  # of a capture
 OUTPUT_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+COMMAND_LINE = "the command line"  # instead of a file: as in yaml_source.py, which costs imports
 CANNOT_WRITE = "cannot write to the standard output: {}"
 
 
@@ -85,7 +95,8 @@ def _variables() -> list[str]:
 
 def _source(path: Path) -> str:
     """Where a configuration comes from, for the user."""
-    return ", ".join([*[str(path)] * os.path.exists(path), *_variables()])  # noqa: PTH110 - False, whatever
+    is_given = str(path) == COMMAND_LINE or os.path.exists(path)  # noqa: PTH110 - False, whatever
+    return ", ".join([*[str(path)] * is_given, *_variables()])
 
 
 def _import_msgspec() -> None:
@@ -114,8 +125,8 @@ def _run(args: argparse.Namespace) -> int:
     from bridged.daemon.status_text import farewell  # noqa: PLC0415
     from bridged.interfaces import open_interface  # noqa: PLC0415
 
-    mounted = MountedConfig(config_path(args.config))
-    config = _load(args.config)
+    mounted = None if args.settings else MountedConfig(config_path(args.config or DEFAULT_NAME))
+    config = _given(args)
     port_opener = _port_opener(args, config)
     open_interface = _opened_as(args.user, config.bus) if args.user else open_interface
     notifier = systemd_notifier()
@@ -132,7 +143,9 @@ def _run(args: argparse.Namespace) -> int:
     memory = FileMemory(state_directory())
 
     def successor(present: Config) -> Bridge | None:
-        fresh = _load(args.config)
+        if args.settings:
+            raise ConfigError(["there is no file to read again, the options hold: start the bridge anew"])
+        fresh = _given(args)
         return None if fresh == present else Bridge(fresh, memory, open_port=port_opener(fresh))
 
     def snapshot() -> dict[str, Any]:
@@ -151,6 +164,22 @@ def _run(args: argparse.Namespace) -> int:
         status.close()
     log.info("%s", farewell(snapshot()))
     return 0
+
+
+def _given(args: argparse.Namespace) -> Config:
+    """The configuration that `run` is given: a file's, or that of its options."""
+    if not args.settings:
+        return _load(args.config or DEFAULT_NAME)
+    from bridged.config import load_options  # noqa: PLC0415 - as above
+    from bridged.overlay import Setting  # noqa: PLC0415
+
+    settings = list(args.settings)
+    if args.config is not None:
+        if Path(args.config).suffix in {".yaml", ".yml"}:
+            text = f"{args.config}: a file is not read where options are keys ({settings[0].name}): "
+            raise ConfigError([f"{text}change the file, or name the interface instead"])
+        settings.append(Setting("INTERFACE", ("bus", "channel"), args.config))
+    return load_options(settings, os.environ)
 
 
 def _port_opener(args: argparse.Namespace, config: Config) -> Callable[[Config], Callable[[str, int], Port]]:
@@ -415,18 +444,22 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, text: str, run: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text, formatter_class=formatter)
+        # Options that are keys are not for argparse: an abbreviated one would be passed over.
+        sub = commands.add_parser(
+            name, help=text, description=text, formatter_class=formatter, allow_abbrev=name != "run"
+        )
         sub.set_defaults(run=run)
         return sub
 
     run = add("run", "Run the bridge of a configuration in the foreground.", _run)
+    run.set_defaults(settings=[])
     run.add_argument(
         "config",
         nargs="?",
-        default=DEFAULT_NAME,
-        metavar="FILE|NAME",
+        metavar="FILE|NAME|INTERFACE",
         help=f"YAML file, or NAME for {CONFIG_DIRECTORY}/NAME.yaml; default: {DEFAULT_NAME}; none is needed "
-        "where the environment has all: CAN_BRIDGE__ADAPTER__PORT is the key port of section adapter",
+        "where the environment has all: CAN_BRIDGE__ADAPTER__PORT is the key port of section adapter. "
+        "With options that are keys: the interface, as vcan0",
     )
     run.add_argument(
         "--socket",
@@ -459,6 +492,9 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         metavar="MB",
         help="the capture ends when its file has so many megabytes; default: 16",
     )
+
+    if command == "run":
+        _describe_keys(run)
 
     interface = add(
         "interface",
@@ -545,6 +581,37 @@ def _list(args: argparse.Namespace) -> int:
     return listing.run(args)
 
 
+def _describe_keys(run: argparse.ArgumentParser) -> None:
+    """For --help; options.py takes them from the arguments before."""
+    from bridged.adapters import TYPES  # noqa: PLC0415
+
+    group = run.add_argument_group(
+        "without a file",
+        "Every key of a file is an option, --SECTION.KEY VALUE, or --KEY where only one section has it; the "
+        "value is YAML. The usual ones:",
+    )
+    group.add_argument("--type", metavar="TYPE", help=f"of the adapter: {' or '.join(TYPES)}")
+    group.add_argument("--port", metavar="PORT", help="as `can-bridge list` shows it: a path or a URL")
+    group.add_argument("--baudrate", metavar="BAUD", help="of the serial line, in bit/s")
+    group.add_argument("--bitrate", metavar="BITRATE", help="of the CAN bus, in bit/s")
+    group.add_argument("--listen-only", action="store_true", help="hear everything, send nothing")
+    group.add_argument(
+        "--create", action="store_true", help="make the interface if it is missing; needs root"
+    )
+
+
+def _take_keys(arguments: list[str]) -> tuple[list[Setting], list[str]]:
+    """The options of `run` that are keys of a configuration, and the other arguments."""
+    options = {argument.partition("=")[0] for argument in arguments if argument.startswith("--")}
+    if arguments[:1] != ["run"] or options <= {*RUN_OPTIONS, "--help"}:
+        return [], arguments
+    _import_msgspec()
+    from bridged.config import keys  # noqa: PLC0415 - only where there are any
+    from bridged.options import take  # noqa: PLC0415
+
+    return take(arguments, keys())
+
+
 def _simulate(args: argparse.Namespace) -> int:
     from bridged.simulators import cli as commands  # noqa: PLC0415
 
@@ -572,7 +639,10 @@ def main(argv: list[str] | None = None) -> int:
 def _perform(arguments: list[str]) -> int:
     command = arguments[0] if arguments else None
     try:
+        settings, arguments = _take_keys(arguments)
         args = _parser(arguments).parse_args(arguments)
+        if settings:
+            args.settings = settings
         return int(args.run(args))
     except ConfigError as error:
         for problem in error.problems:

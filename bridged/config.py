@@ -3,7 +3,7 @@
 import functools
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -12,8 +12,11 @@ from msgspec import Meta, Struct
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bridged import adapters, can
-from bridged.environment import overlay, variables
+from bridged.environment import ORIGIN as ENVIRONMENT
+from bridged.environment import settings as settings_of
+from bridged.environment import variables
 from bridged.errors import ConfigError
+from bridged.overlay import Setting, overlay
 from bridged.ports.names import PortName
 from bridged.settings import (
     AdapterConfig,
@@ -28,10 +31,12 @@ from bridged.settings import (
 )
 from bridged.text import quoted
 from bridged.yaml_source import (
+    COMMAND_LINE,
     Problems,
     Section,
     foreign_tag,
     is_empty,
+    is_flag,
     key_names,
     parse,
     read_text,
@@ -157,6 +162,27 @@ def load(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING)
     return _load(Path(path), environment)[0]
 
 
+def load_options(options: Sequence[Setting], environment: Mapping[str, str] = NOTHING) -> Config:
+    """Return the configuration in options of the command line, and in the environment; no file is read.
+
+    It has the name of the interface. ConfigError with all problems, each with its option.
+    """
+    problems = Problems(COMMAND_LINE)
+    root = overlay(None, settings_of(environment, problems), problems, ENVIRONMENT)
+    root = overlay(root, options, problems, COMMAND_LINE)
+    config = _read("", Path(COMMAND_LINE), _top(root, problems))
+    return msgspec.structs.replace(config, name=config.bus.channel.replace("/", "-"))
+
+
+def keys() -> dict[tuple[str, ...], bool]:
+    """Every section and every key by its path, and whether it is one of true and false."""
+    found: dict[tuple[str, ...], bool] = {(section,): False for section in _TOP}
+    for section, schema in _schemas().items():
+        for field in msgspec.structs.fields(schema):
+            found[(*section.split("."), field.encode_name)] = is_flag(field)
+    return found
+
+
 def check(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING) -> tuple[Config, list[str]]:
     """Return what load() does, and a line for each thing that is allowed but probably not meant.
 
@@ -201,22 +227,28 @@ def _check_python_can(section: Section, bus: BusConfig) -> None:
 def _load(file: Path, environment: Mapping[str, str]) -> tuple[Config, Section]:
     problems = Problems(str(file))
     if variables(environment) and _is_missing(file):
-        root = overlay(None, environment, problems)
+        root = None
         only = [f"{file}: there is no such file: the environment is all there is"]
     else:
-        root = overlay(parse(read_text(file, problems), problems), environment, problems)
+        root = parse(read_text(file, problems), problems)
         only = []
+    root = overlay(root, settings_of(environment, problems), problems, ENVIRONMENT)
+    try:
+        top = _top(root, problems)
+        return _read(file.stem, file, top), top
+    except ConfigError as error:
+        raise ConfigError([*only, *error.problems]) from None
+
+
+def _top(root: Node | None, problems: Problems) -> Section:
+    """The document, if it is a mapping."""
     if not isinstance(root, MappingNode) or foreign_tag(root):
         empty = root is None or is_empty(root)
         what = "the file is empty" if empty else "the file is no mapping (a 'key: value' in each line)"
         line, column = (0, 0) if root is None else (root.start_mark.line, root.start_mark.column)
         problems.add(line, column, f"{what}; expected sections adapter, channel and bus")
         raise problems.error()
-    top = Section(root, _schemas, problems)
-    config = _read_file(file, top)
-    if config is None:
-        raise ConfigError([*only, *problems.error().problems])
-    return config, top
+    return Section(root, _schemas, problems)
 
 
 def _is_missing(file: Path) -> bool:
@@ -229,7 +261,8 @@ def _is_missing(file: Path) -> bool:
     return False
 
 
-def _read_file(path: Path, top: Section) -> Config | None:
+def _read(name: str, path: Path, top: Section) -> Config:
+    """The configuration; ConfigError with all problems."""
     top.refuse_unknown(list(_TOP))
     adapter = _read_adapter(top.section("adapter"))
     channel_section = top.section("channel")
@@ -246,9 +279,9 @@ def _read_file(path: Path, top: Section) -> Config | None:
         health = _read_plain(top.section("health", required=False), _HealthKeys, HealthConfig)
     reconnect = _read_reconnect(top)
     if top.problems or not (adapter and channel and bus and transmit and health and reconnect):
-        return None
+        raise top.problems.error()
     return Config(
-        name=path.stem,
+        name=name,
         path=path,
         adapter=adapter,
         channel=channel,

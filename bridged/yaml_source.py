@@ -34,6 +34,9 @@ MAX_BYTES = 65_536
 VARIABLE_PREFIX = "CAN_BRIDGE__"
 """Of environment variables that stand for keys: see environment.py."""
 
+COMMAND_LINE = "the command line"
+"""Where options stand for keys (see options.py): what bears this name, or one that begins with --."""
+
 CORE = "tag:yaml.org,2002:"
 _KNOWN_TAGS = frozenset(
     CORE + name
@@ -280,8 +283,11 @@ class Section:
 
     def refuse_missing(self, key: str, wanted: str) -> None:
         """Report that a key is not there."""
-        variable = f"{VARIABLE_PREFIX}{self._below(key).replace('.', '__').upper()}"
-        hint = f" ({variable})" if self._parent.start_mark.name else ""
+        path = self._below(key)
+        origin = self._parent.start_mark.name
+        by_option = origin.startswith("--") or origin == COMMAND_LINE
+        other = f"--{path}" if by_option else f"{VARIABLE_PREFIX}{path.replace('.', '__').upper()}"
+        hint = f" ({other})" if origin else ""
         self.problems.add_at(self._parent, f"{self._where(key)}: is missing{hint}; expected {wanted}")
 
     def refuse_unknown(self, allowed: list[str]) -> None:
@@ -366,6 +372,11 @@ def _without_none(type_: Any) -> Any:
     if get_origin(type_) not in (Union, UnionType):
         return type_
     return next(part for part in get_args(type_) if part is not type(None))
+
+
+def is_flag(field: FieldInfo) -> bool:
+    """Whether the key is true or false."""
+    return getattr(_without_none(field.type), "__origin__", None) is bool
 
 
 def key_names(schema: type[Struct]) -> list[str]:

@@ -154,19 +154,23 @@ def users_as_terminal(device: int) -> list[str]:
     return [_described(_PROC / str(number)) for _, number in sorted(found)]
 
 
+_WITHOUT_VALUE: Final = {"--verbose", "--mask", "--create", "--listen-only"}  # the usual options of `run`
+
+
 def _described(process: Path) -> str:
     """`slcand (process 123)`; a bridge by its name, where its command line tells it."""
     try:
         command = (process / "comm").read_text(errors="replace").strip()
-        arguments = (process / "cmdline").read_text(errors="replace").split("\0")
+        words = (process / "cmdline").read_text(errors="replace").split("\0")
     except OSError:
         return f"process {process.name}"
-    programs = {Path(argument).name for argument in arguments[:4]}
-    if "run" in arguments and programs & {"can-bridge", "bridged"}:
-        options = iter(arguments[arguments.index("run") + 1 :])
-        for argument in options:
-            if argument == "--socket":
-                next(options, None)
-            elif argument and not argument.startswith("-"):
+    programs = {Path(word).name for word in words[:4]}
+    if "run" in words and programs & {"can-bridge", "bridged"}:
+        arguments = iter(words[words.index("run") + 1 :])
+        for argument in arguments:
+            if argument.startswith("--"):
+                if "=" not in argument and argument not in _WITHOUT_VALUE:
+                    next(arguments, None)
+            elif argument:
                 return f"bridge {printable(Path(argument).stem)} (process {process.name})"
     return f"{printable(command)} (process {process.name})"

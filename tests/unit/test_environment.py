@@ -107,7 +107,7 @@ def test_the_environment_wins(tmp_path: Path, variables: dict[str, str], same_as
          ["CAN_BRIDGE__: names no key; expected CAN_BRIDGE__SECTION__KEY",
           "CAN_BRIDGE__BUS__: names no key; expected CAN_BRIDGE__SECTION__KEY"]),
         ({"CAN_BRIDGE__BUS__CHANNEL": "a", "CAN_BRIDGE__bus__channel": "b"},
-         ["CAN_BRIDGE__bus__channel: is the same key as CAN_BRIDGE__BUS__CHANNEL; unset one of them"]),
+         ["CAN_BRIDGE__bus__channel: is the same key as CAN_BRIDGE__BUS__CHANNEL; remove one of them"]),
         ({"CAN_BRIDGE__HEALTH__INTERVAL": "9", "CAN_BRIDGE__TRANSMIT": "3"},
          ["CAN_BRIDGE__HEALTH__INTERVAL: health.interval: expected a number of seconds from 0.1 to 0.5, got 9",
           "CAN_BRIDGE__TRANSMIT: transmit: expected a section with queue, window, deadline, got 3"]),

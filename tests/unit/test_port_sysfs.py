@@ -120,6 +120,8 @@ def test_users_of_a_terminal() -> None:
             "bridge pc",
         ),
         ("/usr/bin/python3 -m bridged run pc --verbose", "bridge pc"),
+        ("/usr/bin/python3 -m bridged run --verbose --user 65532 pc", "bridge pc"),
+        ("can-bridge run --type can232 --port=/dev/ttyUSB0 --create vcan0", "bridge vcan0"),
         ("/usr/bin/python3 /usr/bin/can-bridge simulate can232", "can-bridge"),
         ("vi can-bridge run", "can-bridge"),
     ],
