@@ -17,6 +17,7 @@ DIALOUT = 20  # the group of ttys where Debian is the host
 TTYS = ["c 188:* rmw", "c 166:* rmw"]  # ttyUSB, ttyACM
 RAW_USB = "c 189:* rmw"
 NODE, SERIAL_SERVER = "/dev/ttyUSB0", "socket://192.168.1.50:4001"
+BY_SERIAL_NUMBER = "usb-serial://A6008isP"
 DEVICE_PLUGIN = "squat.ai/can-adapter"
 CONFIGURATION = "can-bridge.yaml"
 CONFIGURATIONS, SOCKETS = "/etc/can-bridge", "/run/can-bridge"
@@ -113,7 +114,7 @@ def compose() -> str:
             "restart": "unless-stopped",
         },
     }
-    port = f"${{CAN_PORT:-{NODE}}}"
+    port = f"${{CAN_PORT:-{BY_SERIAL_NUMBER}}}"
     document = {
         "name": IMAGE,
         "services": services,
@@ -122,7 +123,7 @@ def compose() -> str:
     }
     return written(
         f"An adapter on this machine's USB, a bridge, and an application that has {INTERFACE} to itself:\n"
-        "  CAN_PORT=/dev/ttyUSB0 docker compose up --build --detach",
+        "  CAN_PORT=usb-serial://A6008isP docker compose up --build --detach",
         [document],
         {
             "interface:": "Owns the network namespace and makes the interface in it, which outlives each\n"
