@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from bridged.simulators.sja1000 import Frame
 
 TITLE = "CANable 2 with Nakakiyo092's firmware"
-ADAPTER: Final[Mapping[str, str | int]] = {}
+ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
 FAULTS = slcan.FAULTS
 
 

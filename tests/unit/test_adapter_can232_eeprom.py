@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from benches.can232_host import Host, adapter_for
-from benches.clone_parsers import Reference
+from benches.clones import CAN232, clone
 
 from bridged import cli
 from bridged.can import AcceptanceFilter, BitTiming
@@ -61,7 +61,7 @@ def test_the_log_tells_what_was_stored(caplog: pytest.LogCaptureFixture) -> None
     adapter = adapter_for(channel)
     adapter.saw_time_stamps()
     with caplog.at_level(logging.INFO):
-        Host(Reference(), adapter).start()
+        Host(clone(CAN232), adapter).start()
     assert [text for text in caplog.messages if "EEPROM" in text] == [
         "stored 'auto poll' (X1) in the adapter's EEPROM: it now sends received frames unasked",
         "stored 'no time stamps' (Z0) in the adapter's EEPROM: received frames now take less of its line",
