@@ -93,6 +93,24 @@ def test_directories_and_the_link_before_anybody_looks(machine: Machine) -> None
     assert_comes(looking)
 
 
+def test_directories_that_come_while_one_looks(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the two, inotify is told of them in vain, and then of the one that they are in."""
+    link = machine.dev / "serial/by-id/usb-FTDI_A1-if00-port0"
+    add = inotify.Inotify.add
+
+    def add_late(names: inotify.Inotify, directories: set[Path]) -> bool:
+        new = add(names, directories - {machine.dev})
+        link.parent.mkdir(parents=True, exist_ok=True)
+        return add(names, {machine.dev}) or new
+
+    monkeypatch.setattr(inotify.Inotify, "add", add_late)
+    machine.plug("ttyUSB0")
+    looking = machine.watch(link)
+    looking.arm()
+    link.symlink_to("../../ttyUSB0")
+    assert_comes(looking)
+
+
 @pytest.mark.parametrize("absolute", [False, True])
 def test_a_link_whose_target_comes(machine: Machine, tmp_path: Path, absolute: bool) -> None:
     """Through a link to a directory, and a second link."""
