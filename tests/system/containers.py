@@ -46,13 +46,14 @@ UNPRIVILEGED = (*QUIET, "--read-only", "--cap-drop", "ALL", "--security-opt", "n
 INTERFACE_MAKER = (*UNPRIVILEGED, "--user", "0:0", "--cap-add", "NET_ADMIN")
 
 
-def podman(*arguments: str | Path, check: bool = True) -> str:
-    """Its output, both streams; fails if it does."""
+def podman(*arguments: str | Path, check: bool = True, errors: int = subprocess.STDOUT) -> str:
+    """Its output, both streams unless `errors` is subprocess.PIPE; fails if it does."""
     done = subprocess.run(
         ["podman", *map(str, arguments)],
-        check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=2 * DEADLINE_S,
+        check=False, stdout=subprocess.PIPE, stderr=errors, text=True, timeout=2 * DEADLINE_S,
     )  # fmt: skip
-    assert not check or done.returncode == 0, f"podman {arguments}: {done.returncode}: {done.stdout[-3000:]}"
+    said = f"{done.stdout[-3000:]}{done.stderr or ''}"
+    assert not check or done.returncode == 0, f"podman {arguments}: {done.returncode}: {said}"
     return done.stdout.strip()
 
 
@@ -94,8 +95,8 @@ class Container:
         return int(self._state("Pid"))
 
     def execute(self, *command: str) -> str:
-        """Another program in it, which must succeed; its output."""
-        return podman("exec", self.identity, *command)
+        """Another program in it, which must succeed; what it prints, without what it or podman complain of."""
+        return podman("exec", self.identity, *command, errors=subprocess.PIPE)
 
     def wait_log(self, text: str, deadline_s: float = DEADLINE_S) -> None:
         wait_until(lambda: text in self.logs, f"{text!r} in {self}", deadline_s)
