@@ -95,7 +95,7 @@ class Container:
         return int(self._state("Pid"))
 
     def execute(self, *command: str) -> str:
-        """Another program in it, which must succeed; what it prints, without what it or podman complain of."""
+        """Another program in it, which must succeed; its standard output, without complaints of podman."""
         return podman("exec", self.identity, *command, errors=subprocess.PIPE)
 
     def wait_log(self, text: str, deadline_s: float = DEADLINE_S) -> None:
