@@ -199,10 +199,12 @@ def read_state(simulator: HostProcess) -> dict[str, Any]:
 
 class TestUnit:
     def test_verify_is_silent(self) -> None:
-        assert execute("systemd-analyze", "verify", "can-bridge@can232.service") == ""
+        units = ("can-bridge@can232.service", "can-bridge-interface@can232.service")
+        assert execute("systemd-analyze", "verify", *units) == ""
 
     def test_exposure(self) -> None:
-        execute("systemd-analyze", "security", "--offline=true", "--threshold=11", UNIT)
+        for unit, tenths in ((UNIT, 11), (UNIT.with_name("can-bridge-interface@.service"), 13)):
+            execute("systemd-analyze", "security", "--offline=true", f"--threshold={tenths}", unit)
 
     def test_start_and_stop(self, rig: Rig, can232: Instance) -> None:
         status = can232.wait_status("running: ")
