@@ -155,11 +155,16 @@ def test_what_is_unknown_or_has_no_profile(answers: dict[bytes, bytes], text: st
     assert "so it is not used. If you know what it is, say so by `firmware:`" in told
 
 
+@pytest.mark.parametrize("number", [b"N1234\r", b"NA123\r", b"\a"], ids=repr)
 @pytest.mark.parametrize(
-    ("answer", "name"), [(b"\a", "can232"), (b"", "catompiler"), (b"V0103\r", None)], ids=repr
+    ("answer", "name"),
+    [(b"\a", "can232"), (b"V0103\r", "can232"), (b"", "catompiler"), (b"?\r", None)],
+    ids=repr,
 )
-def test_nonsense_tells_catompilers_library_from_a_can232(answer: bytes, name: str | None) -> None:
-    told = {b"V": b"V0103\r", b"N": b"N1234\r", b"VV": answer, b"C": b"\r"}
+def test_nonsense_tells_catompilers_library_from_a_can232(
+    answer: bytes, name: str | None, number: bytes
+) -> None:
+    told = {b"V": b"V0103\r", b"N": number, b"VV": answer, b"C": b"\r"}
     host = Host(Words(told | dict.fromkeys((b"S4", b"O"), b"\r")), adapter_for())
     with contextlib.suppress(AdapterError):
         host.start()
@@ -216,7 +221,7 @@ def test_a_can232_is_none_of_them(is_open: bool) -> None:
     host.start()
     told = host.written[host.written.index(b"V\r") :]
     assert told == [
-        *(b"V\r", b"V\r", b"N\r", b"v\r", b"C\r", b"F\r"),
+        *(b"V\r", b"V\r", b"N\r", b"v\r", b"C\r", b"F\r", b"VV\r"),
         *(b"S4\r", b"M00000000\r", b"mFFFFFFFF\r", b"O\r", b"A\r"),
     ]
 

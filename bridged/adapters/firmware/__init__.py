@@ -95,10 +95,11 @@ BY_CONSTANTS: Final = {
     "latonita": Signature("V1013", "NA123"),
 }
 
-# A CAN232, and what answers V and N as one of them might.
+# A CAN232, and what answers V and N as one of them might. Who builds a device with catompiler's library
+# chooses what it answers to V and N, so only its silence tells.
 BY_ALL_ANSWERS: Final = {
-    "can232": Signature(HEX4, details=BELL, flags=BELL, malformed=BELL),
-    "catompiler": Signature(HEX4, "N1234", details=BELL, flags=BELL, malformed=SILENCE),
+    "can232": Signature(HEX4, details=BELL, flags=BELL, malformed=f"{BELL}|{HEX4}"),
+    "catompiler": Signature(HEX4, details=BELL, flags=BELL, malformed=SILENCE),
     "uccb": Signature(HEX4, details="v0401"),
     "gdramos": Signature("V1020", flags=r"[0-9A-F]{2}"),
 }
