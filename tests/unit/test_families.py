@@ -1,6 +1,7 @@
 """Frames both ways through each firmware that speaks almost a CAN232's protocol: real bridge, relay, pty."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from benches.families import FAMILIES, FamilyBench, Traffic
 from bridged.adapters import firmware
 from bridged.adapters.base import Confirms
 
+LONG = "CAN_BRIDGE_LONG" in os.environ  # ./dev test long
+COUNT = 5000 if LONG else 200
 COUNTERS = {
     Confirms.SENT: "tx_frames",
     Confirms.QUEUED: "tx_queued",
@@ -25,16 +28,15 @@ def family_bench(tmp_path: Path) -> Iterator[FamilyBench]:
         yield made
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(5000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", FAMILIES)
-def test_mixed_frames_both_ways(family_bench: FamilyBench, name: str, count: int) -> None:
+def test_mixed_frames_both_ways(family_bench: FamilyBench, name: str) -> None:
     """All that its firmware can send, exactly and in order; the others are dropped with their reason.
 
     Each is counted as what that firmware vouches for.
     """
     family, bench = FAMILIES[name], family_bench
     bridge = started(bench.family(family))
-    traffic = Traffic(bench, bridge, family, count)
+    traffic = Traffic(bench, bridge, family, COUNT)
     traffic.run()
     status = stopped(bridge)
     bench.pull_out()
@@ -46,7 +48,7 @@ def test_mixed_frames_both_ways(family_bench: FamilyBench, name: str, count: int
     told = {reason: n for reason, n in counters["tx_dropped"].items() if n}
     unsendable = len(traffic.to_device) - len(traffic.sendable)
     assert told == ({"remote-frame": unsendable} if unsendable else {})
-    assert (counters["bus_read"], counters["reconnects"]) == (count, 0)
+    assert (counters["bus_read"], counters["reconnects"]) == (COUNT, 0)
     if device.counters.frames_lost == 0:
         assert traffic.received == traffic.to_host
     else:  # a canable1 while its host is busy: lost in the device, and no other frame made of it
