@@ -1,7 +1,7 @@
 """Simulated CANables with canable-fw and canable2-fw, and a CANtact."""
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.canable1 import Canable1
 from bridged.simulators.canable2 import Canable2

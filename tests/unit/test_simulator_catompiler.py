@@ -1,7 +1,7 @@
 """A simulated device with catompiler's slave library."""
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.catompiler import Catompiler
 

@@ -1,7 +1,7 @@
 """A simulated CANable with Elmue's firmware."""
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.elmue import Elmue
 

@@ -1,7 +1,7 @@
 """A simulated ESP32 with esp32-slcan."""
 
 import pytest
-from benches.clone_talk import REMOTE, Talk
+from benches.clones import REMOTE, Talk
 
 from bridged.simulators.esp32 import Esp32
 from bridged.simulators.sja1000 import Frame

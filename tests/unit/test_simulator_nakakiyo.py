@@ -1,7 +1,7 @@
 """A simulated CANable 2 with Nakakiyo092's firmware."""
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.nakakiyo import Nakakiyo
 

@@ -1,6 +1,6 @@
 """What all simulated clones share: their line, their transmit buffer, their controller."""
 
-from benches.clone_talk import FRAME, Talk
+from benches.clones import FRAME, Talk
 
 from bridged.simulators.nakakiyo import Nakakiyo
 from bridged.simulators.slcan import Slcan

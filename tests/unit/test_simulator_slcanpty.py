@@ -3,7 +3,7 @@
 import dataclasses
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.slcanpty import Slcanpty
 

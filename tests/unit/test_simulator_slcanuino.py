@@ -1,7 +1,7 @@
 """A simulated Arduino with slcanuino."""
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.slcanuino import Slcanuino
 

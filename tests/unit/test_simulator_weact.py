@@ -1,7 +1,7 @@
 """A simulated WeAct USB2CANFDV1."""
 
 import pytest
-from benches.clone_talk import FRAME, REMOTE, Talk
+from benches.clones import FRAME, REMOTE, Talk
 
 from bridged.simulators.weact import Weact
 
