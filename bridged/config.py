@@ -34,6 +34,7 @@ from bridged.yaml_source import (
     COMMAND_LINE,
     Problems,
     Section,
+    describe,
     foreign_tag,
     is_empty,
     is_flag,
@@ -128,7 +129,7 @@ _SECTIONS: dict[str, type[Struct]] = {
     "health": _HealthKeys,
     "reconnect": _ReconnectKeys,
 }
-_TOP = ("adapter", *(path for path in _SECTIONS if "." not in path))
+_TOP = ("adapter", *(path for path in _SECTIONS if "." not in path), "notify")
 
 
 @functools.cache
@@ -188,6 +189,8 @@ def check(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING
 
     ConfigError also where python-can lacks what the interface needs, which takes importing it.
     """
+    import shutil  # noqa: PLC0415 - 5 ms that `run` need not pay
+
     config, top = _load(Path(path), environment)
     adapter, transmit = config.adapter, config.transmit
     section = top.section("adapter")
@@ -207,6 +210,8 @@ def check(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING
         section.warn_key("channel", text)
     if section and config.bus.interface != "socketcan":
         _check_python_can(section, config.bus)
+    if config.notify and not shutil.which(config.notify[0]):
+        top.warn_key("notify", f"there is no program {quoted(config.notify[0])} here")
     if top.problems:
         raise top.problems.error()
     return config, top.problems.warnings()
@@ -278,6 +283,7 @@ def _read(name: str, path: Path, top: Section) -> Config:
     if "health" in top.nodes:
         health = _read_plain(top.section("health", required=False), _HealthKeys, HealthConfig)
     reconnect = _read_reconnect(top)
+    notify = _read_command(top, "notify")
     if top.problems or not (adapter and channel and bus and transmit and health and reconnect):
         raise top.problems.error()
     return Config(
@@ -289,6 +295,7 @@ def _read(name: str, path: Path, top: Section) -> Config:
         transmit=transmit,
         health=health,
         reconnect=reconnect,
+        notify=notify,
     )
 
 
@@ -391,6 +398,21 @@ def _read_reconnect(top: Section) -> ReconnectConfig | None:
         text = f"initial ({reconnect.initial_s:g} s) is more than maximum ({reconnect.maximum_s:g} s)"
         section.refuse_value("maximum" if "maximum" in section.nodes else "initial", text)
     return reconnect
+
+
+def _read_command(top: Section, key: str) -> tuple[str, ...]:
+    """Read a command and its arguments, a list; empty without it, and where that is wrong."""
+    node = top.nodes.get(key)
+    if node is None:
+        return ()
+    words = node.value if isinstance(node, SequenceNode) else []
+    texts = tuple(word.value for word in words if isinstance(word, ScalarNode) and not foreign_tag(word))
+    if texts and len(texts) == len(words) and texts[0] and all(map(str.isprintable, texts)):
+        return texts
+    got = "nothing" if is_empty(node) else "another list" if words else describe(node)
+    wanted = "a list with a command and its arguments, such as [/usr/local/bin/tell, pc]"
+    top.refuse_value(key, f"expected {wanted}, got {got}")
+    return ()
 
 
 def _read_channel(section: Section | None, adapter: AdapterConfig | None) -> ChannelConfig | None:

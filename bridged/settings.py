@@ -117,7 +117,7 @@ class ReconnectConfig(Struct, frozen=True, kw_only=True):
 
 
 class Config(Struct, frozen=True, kw_only=True):
-    """One bridge. `name` is the stem of the file's name."""
+    """One bridge. `name`: the stem of the file's name; `notify`: a command that is told of each new state."""
 
     name: str
     path: Path
@@ -127,3 +127,4 @@ class Config(Struct, frozen=True, kw_only=True):
     transmit: TransmitConfig
     health: HealthConfig = HealthConfig()
     reconnect: ReconnectConfig = ReconnectConfig()
+    notify: tuple[str, ...] = ()

@@ -204,7 +204,12 @@ class Bridge:
         )
         channel = replace(present.channel, restart=config.channel.restart)
         if config != replace(
-            present, channel=channel, transmit=transmit, health=config.health, reconnect=config.reconnect
+            present,
+            channel=channel,
+            transmit=transmit,
+            health=config.health,
+            reconnect=config.reconnect,
+            notify=config.notify,
         ):
             return False
         self.config = config
@@ -238,6 +243,10 @@ class Bridge:
         """The state, the reason why it is not running, whether the interface is open."""
         reason = "; ".join(filter(None, (self.reason, self._interface.reason, self.circle)))
         return self.state, reason, self._interface.opened is not None
+
+    def bus_state(self) -> BusState | None:
+        """That of the CAN bus; None: not known."""
+        return self._polling.health.state
 
     def snapshot(self) -> dict[str, Any]:
         """State and counters; see status.py for the meaning of each."""

@@ -24,7 +24,8 @@ MISSING = (
 class Notifier:
     """Tells systemd what it wants to know; without `send` it tells nobody.
 
-    `feed_interval_s`: how often the watchdog wants feed(), None if there is none.
+    `feed_interval_s`: how often the watchdog wants feed(), None if there is none. `feed_at`: when the next
+    is due, in seconds of time.monotonic(); None: before it is ready.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class Notifier:
         self._send = send
         self._status = ""
         self.feed_interval_s = feed_interval_s
+        self.feed_at: float | None = None
 
     def ready(self) -> None:
         """Started, or done with a reload."""

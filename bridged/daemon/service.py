@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bridged.bridge.bridge import Bridge
     from bridged.daemon.config_map import MountedConfig
     from bridged.daemon.neighbours import Neighbours
+    from bridged.daemon.state_hook import StateHook
     from bridged.daemon.status import StatusServer
     from bridged.settings import Config
 
@@ -102,9 +103,9 @@ class Service:
         self._status = ""
         self._told: tuple[object, ...] = ()
         self._refusal = ""  # why the last reload was refused
-        self._feed_at: float | None = None
         self._own_socket: Path | None = None
         self._neighbours: Neighbours | None = None
+        self._hook: StateHook | None = None
 
     def run(self, status: StatusServer | None = None) -> None:
         """Runs until a signal has stopped it and the adapter is closed."""
@@ -128,13 +129,16 @@ class Service:
                 raise
             finally:
                 self.bridge.close()
+                if self._hook is not None:
+                    self._hook.close()
 
     def _watch(self, selector: selectors.BaseSelector) -> None:
         for fd in self.bridge.filenos():
             selector.register(fd, selectors.EVENT_READ, self.bridge.on_readable)
 
     def _turn(self, selector: selectors.BaseSelector) -> None:
-        timers = [self._feed_at, self._ready_at, self._mounted.next_at if self._mounted else None]
+        timers = [self._notifier.feed_at, self._ready_at]
+        timers += [part.next_at for part in (self._mounted, self._hook) if part]
         if not self.bridge.finished:
             timers.append(self.bridge.next_timer())
         timer = min((at for at in timers if at is not None), default=None)
@@ -231,6 +235,17 @@ class Service:
         state, reason, interface_open = self.bridge.condition()
         self._tell_status(state, reason, interface_open=interface_open)
         self._tell_ready(time.monotonic(), reason, interface_open=interface_open)
+        self._tell_command(time.monotonic())
+
+    def _tell_command(self, now: float) -> None:
+        command = self.bridge.config.notify
+        if self._hook is None:
+            if not command:
+                return
+            from bridged.daemon.state_hook import StateHook  # noqa: PLC0415 - most have none
+
+            self._hook = StateHook()
+        self._hook.look(command, self._hook.change_of(self.bridge), now)
 
     def _tell_status(self, state: State, reason: str, *, interface_open: bool) -> None:
         told = (self.bridge, state, reason, interface_open, self._refusal)
@@ -250,14 +265,14 @@ class Service:
             log.error("ready without the CAN interface, which is tried again each second: %s", reason)
         self._notifier.ready()
         if self._notifier.feed_interval_s is not None:
-            self._feed_at = now
+            self._notifier.feed_at = now
 
     def _feed(self, now: float) -> None:
         """Feeds the watchdog if the relay has turned since the last time: each feeding gives it cause to."""
         interval_s = self._notifier.feed_interval_s
-        if interval_s is None or self._feed_at is None or now < self._feed_at:
+        if interval_s is None or self._notifier.feed_at is None or now < self._notifier.feed_at:
             return
-        self._feed_at = now + interval_s
+        self._notifier.feed_at = now + interval_s
         if self.bridge.finished or self.bridge.has_turned():
             self._notifier.feed()
         else:

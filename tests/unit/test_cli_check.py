@@ -27,6 +27,11 @@ def warnings_of(tmp_path: Path, text: str) -> list[str]:
             "4:12: transmit.deadline: warning: a frame may reach",
         ),
         ("vcan0}", "vcan0}\ntransmit: {window: 5}", "4:12: transmit.window: warning: a CAN232 can hold 2"),
+        (
+            "vcan0}",
+            "vcan0}\nnotify: [/nowhere/tell, pc]",
+            "4:1: notify: warning: there is no program '/nowhere",
+        ),
         ("vcan0}", "can0, create: true}", "3:7: bus.channel: warning: a virtual interface of this name"),
     ],
 )
@@ -41,6 +46,7 @@ def test_what_is_probably_not_meant(tmp_path: Path, old: str, new: str, warning:
         GOOD,
         GOOD.replace("/dev/ttyUSB0", "/tmp/can232"),
         GOOD + "transmit: {window: 2, deadline: 10}\n",
+        GOOD + "notify: [sh, -c, 'echo $CAN_BRIDGE_STATE']\n",
         GOOD.replace("can232", "usb2can") + "transmit: {window: 32}\n",
         GOOD.replace("vcan0", "virt, interface: virtual, rx_queue_size: 5, preserve_timestamps: yes"),
         GOOD.replace(

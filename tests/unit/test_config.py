@@ -212,6 +212,8 @@ def test_the_examples_show_every_key_and_the_defaults(file: Path, type_: str) ->
         for key in key_names(schema):
             shows = re.search(rf"^ +(# )?({key}: |acceptance: .*\b{key}: )", text, re.MULTILINE)
             assert shows, f"config/{type_}.yaml has no line, or comment, for {key} of {section}"
+    for key in config._TOP:
+        assert re.search(rf"^(# )?{key}:", text, re.MULTILINE), f"config/{type_}.yaml: {key}?"
     shown = load(REPOSITORY / "config" / f"{type_}.yaml")
     file.write_text(four_lines(f"{{type: {type_}, port: /dev/ttyUSB0}}"))
     defaults = load(file)
@@ -474,14 +476,14 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "unknown": ("adapter:\n  type: can232\n  port: /dev/x\n  baud: 1\nchannel: {bitrate: 125000}\nbus: {channel: vcan0, loop: true}\ntransmitt: {}\n1: 2\n", [
         f"4:3: adapter.baud: unknown key, baudrate is probably meant; allowed here: {CAN232_KEYS}",
         f"6:23: bus.loop: unknown key; allowed here: {BUS_KEYS}",
-        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit, health, reconnect",
-        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit, health, reconnect",
+        "7:1: transmitt: unknown key, transmit is probably meant; allowed here: adapter, channel, bus, transmit, health, reconnect, notify",
+        "8:1: 1: unknown key; allowed here: adapter, channel, bus, transmit, health, reconnect, notify",
     ]),
     "in the wrong section": ("adapter: {type: can232, port: /dev/x, bitrate: 1, channel: a}\nchannel: {bitrate: 125000, mask: 1}\nbus: {channel: vcan0}\nport: /dev/x\n", [
         f"1:39: adapter.bitrate: unknown key, it belongs to channel; allowed here: {CAN232_KEYS}",
         f"1:51: adapter.channel: unknown key, it belongs to bus; allowed here: {CAN232_KEYS}",
         f"2:28: channel.mask: unknown key, it belongs to channel.acceptance; allowed here: {CHANNEL_KEYS}",
-        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health, reconnect",
+        "4:1: port: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health, reconnect, notify",
     ]),
     "hyphen, capitals": (channel("bitrate: 125000, listen-only: true, BTR0: 3"), [
         f"2:28: channel.listen-only: unknown key, listen_only is probably meant; allowed here: {CHANNEL_KEYS}",
@@ -508,7 +510,7 @@ CASES: dict[str, tuple[str | bytes, list[str]]] = {
     "in the wrong section, of usb2can": ("adapter: {type: usb2can, port: /dev/x, btr0: 1, ready: 2}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\nready_limit: 3\n", [
         f"1:40: adapter.btr0: unknown key, it belongs to channel; allowed here: {USB2CAN_KEYS}",
         f"1:49: adapter.ready: unknown key, ready_limit is probably meant; allowed here: {USB2CAN_KEYS}",
-        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health, reconnect",
+        "4:1: ready_limit: unknown key, it belongs to adapter; allowed here: adapter, channel, bus, transmit, health, reconnect, notify",
     ]),
     "of the other adapter": (adapter("ready_limit: 99, critical_limit: 15, critical_limit: ~"), [
         "1:39: adapter.ready_limit: goes with type: usb2can; remove it",
@@ -619,6 +621,41 @@ def test_sample_point_out_of_reach(file: Path) -> None:
     assert problems_of(file, channel("bitrate: 320000, sample_point: 0.9")) == [
         "2:42: channel.sample_point: 0.9 cannot be had at 320000 bit/s; nearest is 0.68; or give btr0 and btr1"
     ]
+
+
+@pytest.mark.parametrize(
+    ("value", "command"),
+    [
+        ("[/usr/local/bin/tell]", ("/usr/local/bin/tell",)),
+        ("[tell, pc, 0123, yes, '']", ("tell", "pc", "0123", "yes", "")),
+        ("\n- tell\n- pc", ("tell", "pc")),
+    ],
+)
+def test_the_command_of_notify(file: Path, value: str, command: tuple[str, ...]) -> None:
+    """Its words are taken as they are written."""
+    file.write_text(four_lines("{type: can232, port: /dev/x}") + f"notify: {value}\n")
+    assert load(file).notify == command
+
+
+@pytest.mark.parametrize(
+    ("value", "got"),
+    [
+        ("/usr/local/bin/tell", "the text '/usr/local/bin/tell'"),
+        ("", "nothing"),
+        ("[]", "a list"),
+        ("['']", "another list"),
+        ("[tell, [pc]]", "another list"),
+        ("[tell, !secret pc]", "another list"),
+        ('["tell", "a\\nb"]', "another list"),
+        ("{run: tell}", "a mapping"),
+    ],
+)
+def test_no_command_for_notify(file: Path, value: str, got: str) -> None:
+    text = four_lines("{type: can232, port: /dev/x}") + f"notify: {value}\n"
+    line = text.count("\n")
+    wanted = "expected a list with a command and its arguments, such as [/usr/local/bin/tell, pc]"
+    (problem,) = problems_of(file, text)
+    assert re.fullmatch(rf"{line}:\d+: notify: {re.escape(wanted)}, got {re.escape(got)}", problem)
 
 
 def test_python_can_too_old(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,7 +94,7 @@ def test_the_environment_wins(tmp_path: Path, variables: dict[str, str], same_as
         ({"CAN_BRIDGE__CHANNEL__ACCEPTANCE": "{code: 1, mask: x}"},
          ["CAN_BRIDGE__CHANNEL__ACCEPTANCE:1:17: channel.acceptance.mask: expected a number from 0x00000000 to 0xFFFFFFFF, got the text 'x'"]),
         ({"CAN_BRIDGE__CHANEL__BITRATE": "1"},
-         ["CAN_BRIDGE__CHANEL__BITRATE: chanel: unknown key, channel is probably meant; allowed here: adapter, channel, bus, transmit, health, reconnect"]),
+         ["CAN_BRIDGE__CHANEL__BITRATE: chanel: unknown key, channel is probably meant; allowed here: adapter, channel, bus, transmit, health, reconnect, notify"]),
         ({"CAN_BRIDGE__CHANNEL__BTR0": "1"},
          ["CAN_BRIDGE__CHANNEL__BTR0: channel.btr0: excludes bitrate; give bitrate, or btr0 and btr1"]),
         ({"CAN_BRIDGE__BUS": "{channel: vcan0"},

@@ -1,6 +1,7 @@
 """The process: signals, reload, what systemd is told. systemd itself is in tests/system/test_systemd.py."""
 
 import fcntl
+import json
 import logging
 import os
 import re
@@ -208,6 +209,25 @@ class TestProcess:
         assert "reload: nothing has changed" in log
         assert f"reload refused: {file}:2:11: channel.bitrat" in log
         assert log.count("bus open") == 1
+
+    def test_a_command_is_told_of_the_state_and_does_not_delay_the_end(
+        self, tmp_path: Path, systemd: Systemd, start: Callable[..., subprocess.Popen[str]]
+    ) -> None:
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        script = f"exec >{fifo}; trap '' TERM; echo $CAN_BRIDGE_NAME is $CAN_BRIDGE_STATE; sleep 1000; true"
+        file = write_config(tmp_path / "one.yaml")
+        process = start(file)
+        systemd.wait_for("STATUS=waiting: ")
+        file.write_text(f"{file.read_text()}notify: {json.dumps(['sh', '-c', script])}\n")
+        process.send_signal(signal.SIGHUP)
+        with fifo.open() as told:
+            assert told.readline() == "one is waiting\n"
+            process.terminate()
+            assert told.read() == ""  # nobody is left who could write
+        _, log = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0
+        assert "the adapter stays open" in log
 
     def test_the_watchdog_is_fed(
         self, tmp_path: Path, systemd: Systemd, start: Callable[..., subprocess.Popen[str]]
@@ -467,7 +487,7 @@ class TestWatchdog:
         made = Service(bridge, Notifier(heard.append, 5.0))
         made._feed(0.0)
         assert heard == []  # not ready yet
-        made._feed_at = 0.0
+        made._notifier.feed_at = 0.0
         made._feed(0.0)
         made._feed(4.9)
         assert heard == ["WATCHDOG=1"]
