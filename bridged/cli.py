@@ -493,7 +493,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         help="the capture ends when its file has so many megabytes; default: 16",
     )
 
-    if command == "run":
+    if command == "run" and _has_other_options(arguments):
         _describe_keys(run)
 
     interface = add(
@@ -600,10 +600,15 @@ def _describe_keys(run: argparse.ArgumentParser) -> None:
     )
 
 
+def _has_other_options(arguments: list[str]) -> bool:
+    """Whether there are options that may be keys, or ask for help: a start with a file does without them."""
+    options = {argument.partition("=")[0] for argument in arguments if argument.startswith("-")}
+    return not options <= RUN_OPTIONS
+
+
 def _take_keys(arguments: list[str]) -> tuple[list[Setting], list[str]]:
     """The options of `run` that are keys of a configuration, and the other arguments."""
-    options = {argument.partition("=")[0] for argument in arguments if argument.startswith("--")}
-    if arguments[:1] != ["run"] or options <= {*RUN_OPTIONS, "--help"}:
+    if arguments[:1] != ["run"] or not _has_other_options(arguments):
         return [], arguments
     _import_msgspec()
     from bridged.config import keys  # noqa: PLC0415 - only where there are any

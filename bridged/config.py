@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -16,7 +16,6 @@ from bridged.environment import ORIGIN as ENVIRONMENT
 from bridged.environment import settings as settings_of
 from bridged.environment import variables
 from bridged.errors import ConfigError
-from bridged.overlay import Setting, overlay
 from bridged.ports.names import PortName
 from bridged.settings import (
     AdapterConfig,
@@ -43,6 +42,9 @@ from bridged.yaml_source import (
     read_text,
     scalar_value,
 )
+
+if TYPE_CHECKING:
+    from bridged.overlay import Setting
 
 LONG_DEADLINE_S = 10.0
 NOTHING: Mapping[str, str] = {}
@@ -163,11 +165,13 @@ def load(path: str | os.PathLike[str], environment: Mapping[str, str] = NOTHING)
     return _load(Path(path), environment)[0]
 
 
-def load_options(options: Sequence[Setting], environment: Mapping[str, str] = NOTHING) -> Config:
+def load_options(options: "Sequence[Setting]", environment: Mapping[str, str] = NOTHING) -> Config:
     """Return the configuration in options of the command line, and in the environment; no file is read.
 
     It has the name of the interface. ConfigError with all problems, each with its option.
     """
+    from bridged.overlay import overlay  # noqa: PLC0415 - as below
+
     problems = Problems(COMMAND_LINE)
     root = overlay(None, settings_of(environment, problems), problems, ENVIRONMENT)
     root = overlay(root, options, problems, COMMAND_LINE)
@@ -237,7 +241,10 @@ def _load(file: Path, environment: Mapping[str, str]) -> tuple[Config, Section]:
     else:
         root = parse(read_text(file, problems), problems)
         only = []
-    root = overlay(root, settings_of(environment, problems), problems, ENVIRONMENT)
+    if variables(environment):
+        from bridged.overlay import overlay  # noqa: PLC0415 - a file alone does without
+
+        root = overlay(root, settings_of(environment, problems), problems, ENVIRONMENT)
     try:
         top = _top(root, problems)
         return _read(file.stem, file, top), top

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from bridged.overlay import Setting
 from bridged.yaml_source import VARIABLE_PREFIX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from bridged.overlay import Setting
     from bridged.yaml_source import Problems
 
 ORIGIN: Final = "the environment"
@@ -28,6 +28,8 @@ def variables(environment: Mapping[str, str]) -> list[str]:
 
 def settings(environment: Mapping[str, str], problems: Problems) -> list[Setting]:
     """What the variables set; those that name no key are problems."""
+    from bridged.overlay import Setting  # noqa: PLC0415 - a configuration in a file alone does without
+
     found = [Setting(name, _path(name), environment[name]) for name in variables(environment)]
     for setting in found:
         if not all(setting.path):

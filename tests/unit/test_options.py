@@ -85,7 +85,9 @@ def test_no_option_of_run_is_a_key() -> None:
 
 def test_run_knows_its_own_options() -> None:
     """Any other option is looked for among the keys."""
-    (commands,) = [action for action in cli._parser(["run"])._actions if isinstance(action.choices, dict)]
+    (commands,) = [
+        action for action in cli._parser(["run", "--help"])._actions if isinstance(action.choices, dict)
+    ]
     run: Any = commands.choices["run"]  # type: ignore[index,call-overload]
     options = {option for action in run._actions for option in action.option_strings}
     shown = {option.removeprefix("--").replace("-", "_") for option in options - cli.RUN_OPTIONS}
@@ -176,3 +178,24 @@ def test_a_bridge_without_a_file(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         wait_for("stopped after", process.stderr)
     assert process.returncode == 0
+
+
+def test_a_start_with_a_file_loads_nothing_for_it(tmp_path: Path) -> None:
+    """Neither for options, nor for a list, nor for a command of `notify` that is not there."""
+    file = tmp_path / "one.yaml"
+    text = "adapter: {type: can232, port: /x}\nchannel: {bitrate: 125000}\nbus: {interface: virtual, channel: a}\n"
+    file.write_text(text)
+    code = (
+        "import sys; from bridged.cli import main; main(sys.argv[1:]); "
+        "print(*(name for name in sys.modules if name.startswith('bridged')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", "--socket", "/proc/none/socket", str(file)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    loaded = set(done.stdout.split())
+    assert "bridged.daemon.service" in loaded, done.stderr
+    rare = {"bridged.overlay", "bridged.options", "bridged.listing", "bridged.daemon.state_hook"}
+    assert not loaded & rare
