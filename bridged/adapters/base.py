@@ -103,7 +103,6 @@ class Sending(NamedTuple):
     paced_bitrate: int | None = None  # bit/s: frames go no faster than a bus of this rate takes them
     retries: bool = True  # False: a refused frame may have been on the bus, so it is not sent again
     long_stamps: bool = False  # received frames may have time stamps of 8 digits
-    probation: int | None = None  # frames that it gets after its buffer was stuck, until one is seen to leave
     keeps_buffer: bool = False  # closing the channel does not empty the buffer
     kept: int = 0  # how many frames such a buffer has room for
 

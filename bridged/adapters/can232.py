@@ -299,8 +299,8 @@ class Can232:
             if answer.reply is TEXT:
                 on_bus_s = 2 * profile.buffer * LONGEST_FRAME_BITS / self._channel.timing.bitrate
                 yield pause(min(on_bus_s, DRAIN_LONGEST_S))
-        if profile is not None and profile.close_answers == (NONE,):
-            yield from self._close_unanswered(profile)
+        if profile is not None and NONE in profile.close_answers:
+            yield from self._close(profile)
             return
         yield self._close_step()
         answer = yield self._close_step()
@@ -316,15 +316,13 @@ class Can232:
         return self._step(b"C\r", "close the channel", (OK, REFUSED, NONE), ())
 
     def _close(self, profile: Profile) -> Steps:
+        """Where C may have no answer, that V has one shows that the device has come as far as that."""
         if profile.close_answers == (NONE,):
-            yield from self._close_unanswered(profile)
+            yield self._step(b"C\r", "close the channel", (NONE,), ())
         else:
             yield self._close_step()
-
-    def _close_unanswered(self, profile: Profile) -> Steps:  # noqa: ARG002
-        """That V is answered shows that it has come as far as that."""
-        yield self._step(b"C\r", "close the channel", (NONE,), ())
-        yield self.sync._replace(accept=ANYTHING, reject=())
+        if NONE in profile.close_answers:
+            yield self.sync._replace(accept=ANYTHING, reject=())
 
     # --- settings -----------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "CANable 2 with canable2-fw"
-ADAPTER: Final[Mapping[str, str | int]] = {}
+ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
 FAULTS = slcan.FAULTS
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "slave library of catompiler"
-ADAPTER: Final[Mapping[str, str | int]] = {}
+ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
 FAULTS = slcan.FAULTS
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "CANable with Elmue's firmware 2.5"
-ADAPTER: Final[Mapping[str, str | int]] = {}
+ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
 FAULTS = slcan.FAULTS
 
 GIVES_UP_S = 0.5

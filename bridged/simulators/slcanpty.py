@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 TITLE = "slcanpty of can-utils"
-ADAPTER: Final[Mapping[str, str | int]] = {}
+ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232", "firmware": "slcanpty"}
 FAULTS = slcan.FAULTS
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bridged.simulators.sja1000 import Frame
 
 TITLE = "WeAct USB2CANFDV1"
-ADAPTER: Final[Mapping[str, str | int]] = {}
+ADAPTER: Final[Mapping[str, str | int]] = {"type": "can232"}
 FAULTS = slcan.FAULTS
 
 ONE_SHOT_S = 0.001  # what one try of a frame without acknowledgement takes

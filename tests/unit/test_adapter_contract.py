@@ -27,6 +27,8 @@ from bridged.simulators.faults import Fault
 from bridged.simulators.sja1000 import Frame
 
 SLOW_BUS = 50_000  # bit/s
+# Their firmware cannot be asked whether the channel is open: a reset is seen by the port that goes.
+HIDE_A_RESET = {"canable2", "elmue", "slcanpty", "weact"}
 FOREIGN = Frame(0x7F0, False, False, 0, b"")
 
 DRIVEN = [name for name in SIMULATORS if simulator(name).ADAPTER]
@@ -63,6 +65,12 @@ def sent(bench: ContractBench, *frames: Frame) -> Callable[[], bool]:
     count = len(bench.frames) + len(frames)
     bench.send(*frames)
     return lambda: len(bench.frames) >= count
+
+
+def all_taken(bench: ContractBench, bridge: Bridge, *frames: Frame) -> Callable[[], bool]:
+    """The same, and whether the bridge has been told so: one device answers when a frame was on its bus."""
+    out = sent(bench, *frames)
+    return lambda: out() and taken(bridge.snapshot()["counters"]) == len(frames)
 
 
 def dropped(bridge: Bridge, count: int) -> Callable[[], bool]:
@@ -104,7 +112,7 @@ def test_ten_starts_and_stops(bench: ContractBench) -> None:
     bench.plug_in(bench.new_device())
     for number in range(10):
         bridge = started(bench.bridge())
-        run_until(bridge, sent(bench, *numbered(number, 3)))
+        run_until(bridge, all_taken(bench, bridge, *numbered(number, 3)))
         assert taken(stopped(bridge)["counters"]) == 3
     bench.pull_out()
     assert bench.frames == [frame for number in range(10) for frame in numbered(number, 3)]
@@ -155,7 +163,7 @@ def test_the_plug_pulled_in_each_step_of_initialisation(bench: ContractBench) ->
     assert number > 3
     assert bench.frames == []
     frames = numbered(0x100, 3)
-    run_until(bridge, sent(bench, *frames))
+    run_until(bridge, all_taken(bench, bridge, *frames))
     assert taken(stopped(bridge)["counters"]) == len(frames)
     bench.pull_out()
     assert bench.frames == frames
@@ -193,6 +201,8 @@ def test_a_reset_amid_initialisation(bench: ContractBench) -> None:
 
     In the first step, in one amid, and after the last.
     """
+    if bench.name in HIDE_A_RESET:
+        pytest.skip("its port goes with a reset")
     bench.plug_in(bench.new_device())
     stopped(started(bench.bridge()))
     bench.pull_out()

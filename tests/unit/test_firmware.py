@@ -36,7 +36,6 @@ def test_a_profile_says_what_can_be(profile: Profile) -> None:
     assert profile.answers or sending.confirms in {Confirms.NOTHING, Confirms.ALWAYS}
     assert sending.window is None or 1 <= sending.window <= 32
     assert sending.depth <= profile.buffer, "more frames than it has room for"
-    assert sending.probation is None or sending.probation <= profile.buffer
     assert sending.paced_bitrate is None, "that is the channel's"
     assert (sending.confirms is Confirms.NOTHING) <= profile.paced, "nothing else holds it back"
     assert profile.bus_off_flag is None or profile.flags

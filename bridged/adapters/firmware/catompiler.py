@@ -10,7 +10,7 @@ PROFILE = Profile(
     close_answers=(Reply.OK, Reply.REFUSED),
     bitrates=BITRATES,
     registers=True,
-    sending=Sending(confirms=Confirms.QUEUED, window=1, keeps_buffer=True, probation=4),
+    sending=Sending(confirms=Confirms.QUEUED, window=1, keeps_buffer=True),
     buffer=32,
     stamp_digits=(4,),
     longest_line=32,

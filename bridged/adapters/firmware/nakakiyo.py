@@ -13,7 +13,7 @@ PROFILE = Profile(
     close_answers=(Reply.OK, Reply.REFUSED),
     bitrates=BITRATES,
     passes_all=True,
-    sending=Sending(confirms=Confirms.QUEUED, window=32, depth=56, probation=4, long_stamps=True),
+    sending=Sending(confirms=Confirms.QUEUED, window=32, depth=56, long_stamps=True),
     paced=True,  # a frame that it refuses, being full, would be overtaken by the next in the window
     buffer=64,
     stamp_digits=(4, 8),

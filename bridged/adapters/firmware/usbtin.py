@@ -11,7 +11,7 @@ PROFILE = Profile(
     bitrates=BITRATES,  # s has three bytes, CNF1 to CNF3; W writes a register of the controller
     passes_all=True,
     # The controller may send what is in its three buffers in another order: one at a time then.
-    sending=Sending(confirms=Confirms.QUEUED, window=1, depth=1, keeps_buffer=True, probation=3),
+    sending=Sending(confirms=Confirms.QUEUED, window=1, depth=1, keeps_buffer=True),
     paced=True,
     buffer=3,
     in_order=False,

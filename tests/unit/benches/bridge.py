@@ -148,20 +148,21 @@ class ContractBench(Bench):
     def plug_in(self, device: Device, **options: Any) -> None:
         super().plug_in(device, bus=self._ends[0], **options)
 
-    def bridge(self, *, bitrate: int = 500_000, **_options: object) -> Bridge:
+    def bridge(self, *, bitrate: int = 500_000, deadline_s: float = LIMIT_S, **_options: object) -> Bridge:
         """One after the other, each with an interface of its own. Steps that are asked for are in `asked`."""
         self.bus.close()
         self.bus.far.close()
         self.bus = PairBus()
         path = self.folder / "bench.yaml"
-        serial = {"baudrate": 1_000_000} if hasattr(self.new_device(), "uart") else {}
+        adapter = simulator(self.name).ADAPTER
+        serial = {"baudrate": 1_000_000} if adapter["type"] == "can232" else {}
         config = {
-            "adapter": {**simulator(self.name).ADAPTER, "port": str(self.link), **serial},
+            "adapter": {**adapter, "port": str(self.link), **serial},
             "channel": {"bitrate": bitrate},
             "health": {"interval": 0.1},
             "bus": {"channel": "vcan0"},
             "reconnect": {"initial": 0.01, "maximum": 0.01},
-            "transmit": {"deadline": LIMIT_S},
+            "transmit": {"deadline": deadline_s},
         }
         path.write_text(json.dumps(config))
         bridge = self.bridge_of(path)
