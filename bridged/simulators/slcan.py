@@ -314,8 +314,10 @@ class Slcan:
     def flags(self) -> bytes:
         """`Fxx` as the CAN232's manual has the bits; what was lost is forgotten."""
         flags, self._flags = self._flags, 0
-        flags |= WARNING_FLAG if self._errors >= 96 else 0
-        flags |= PASSIVE_FLAG if self._errors >= 128 else 0
+        tries_in_vain = not self.acknowledged and bool(self._buffer) and self.sends()
+        errors = 128 if tries_in_vain else self._errors  # ISO 11898: error-passive, and never bus-off
+        flags |= WARNING_FLAG if errors >= 96 else 0
+        flags |= PASSIVE_FLAG if errors >= 128 else 0
         flags |= BUS_ERROR_FLAG if self.bus_off else 0
         return b"F%02X\r" % flags
 

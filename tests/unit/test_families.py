@@ -1,16 +1,16 @@
 """Frames both ways through each firmware that speaks almost a CAN232's protocol: real bridge, relay, pty."""
 
-import contextlib
 import os
-from collections.abc import Iterator
-from pathlib import Path
+import time
 
 import pytest
-from benches.bridge import started, stopped
+from benches.bridge import LIMIT_S, run_until, started, stopped
 from benches.families import FAMILIES, FamilyBench, Traffic
 
 from bridged.adapters import firmware
 from bridged.adapters.base import Confirms
+from bridged.simulators.faults import Fault
+from bridged.simulators.sja1000 import Frame
 
 LONG = "CAN_BRIDGE_LONG" in os.environ  # ./dev test long
 COUNT = 5000 if LONG else 200
@@ -20,12 +20,6 @@ COUNTERS = {
     Confirms.ALWAYS: "tx_unconfirmed",
     Confirms.NOTHING: "tx_unconfirmed",
 }
-
-
-@pytest.fixture
-def family_bench(tmp_path: Path) -> Iterator[FamilyBench]:
-    with contextlib.closing(FamilyBench(tmp_path)) as made:
-        yield made
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -55,4 +49,54 @@ def test_mixed_frames_both_ways(family_bench: FamilyBench, name: str) -> None:
         rest = iter(traffic.to_host)
         assert all(frame in rest for frame in traffic.received)
         assert family.firmware == "canable1"
+    assert device.effects == []
+
+
+OUTAGE_S = 10.0 if LONG else 1.0
+DEADLINE_S, STUCK_S = 0.3, 0.5  # the second is how long an adapter may be stuck, see recovery.stuck_s()
+LATE_S = 0.3  # a busy machine
+STOPS_WITHIN_S = 2.0
+
+
+@pytest.mark.parametrize("name", sorted(FAMILIES.keys() - {"slcanpty"}))  # which has no CAN bus of its own
+def test_nobody_acknowledges_for_a_time(family_bench: FamilyBench, name: str) -> None:
+    """What leaves the adapter afterwards is young, or counted as in doubt. And the bridge stops meanwhile."""
+    family, bench = FAMILIES[name]._replace(bitrate=125_000), family_bench
+    born: list[float] = []
+    ages: list[float] = []
+
+    def on_the_bus(frame: Frame) -> None:
+        ages.append(time.monotonic() - born[int.from_bytes(frame.data)])
+
+    bench.on_bus = on_the_bus
+    bridge = started(bench.family(family, transmit={"deadline": DEADLINE_S}, health={"interval": 0.1}))
+
+    def send_until(end: float) -> bool:
+        """A frame each 5 ms, as long as that lasts."""
+        now = time.monotonic()
+        if not born or now > born[-1] + 0.005:
+            born.append(now)
+            bench.send(Frame(0x100, False, False, 8, (len(born) - 1).to_bytes(8)))
+        return now > end
+
+    def outage(seconds: float) -> None:
+        bench.befall(Fault("noack", 0, seconds))
+        end = time.monotonic() + seconds
+        run_until(bridge, lambda: send_until(end))
+
+    outage(OUTAGE_S)
+    end = time.monotonic() + 0.5
+    run_until(bridge, lambda: send_until(end))
+    bench.befall(Fault("noack", 0, LIMIT_S))
+    end = time.monotonic() + 0.3
+    run_until(bridge, lambda: send_until(end))
+    stopping = time.monotonic()
+    status = stopped(bridge)
+    assert time.monotonic() - stopping < STOPS_WITHIN_S
+    bench.pull_out()
+    counters, device = status["counters"], bench.device
+    old = [age for age in ages if age > DEADLINE_S + STUCK_S + LATE_S]
+    in_doubt = counters["tx_late"] + counters["tx_unconfirmed"] + counters["tx_dropped"]["unanswered"]
+    assert len(old) <= min(in_doubt, device.transmit_room + 1)
+    assert counters["reconnects"] <= OUTAGE_S / STUCK_S + 2
     assert device.effects == []

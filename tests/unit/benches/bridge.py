@@ -60,6 +60,7 @@ class Bench:
         self.folder = folder
         self.link = folder / "can232"
         self.frames: list[Frame] = []  # that the adapter put on its CAN bus
+        self.on_bus: Callable[[Frame], None] = self.frames.append
         self.bus = PairBus()
         self.open_port: Callable[[str, int], Any] = open_port
         self.open_interface: Callable[..., Any] = lambda *_args, **_options: self.bus
@@ -71,7 +72,7 @@ class Bench:
     def plug_in(self, device: Device, **options: Any) -> None:
         """`options` of the Simulator."""
         self.device: Any = device
-        self._simulator = Simulator(device, link=self.link, on_frame=self.frames.append, **options)
+        self._simulator = Simulator(device, link=self.link, on_frame=self.on_bus, **options)
         self._thread = threading.Thread(target=self._simulator.run)
         self._thread.start()
         while not self.link.exists():
