@@ -186,13 +186,14 @@ class Recognition:
 
     def _recognise(self, version: str) -> Generator[Exchange, Answer, Recognised]:
         seen = firmware.Seen(version)
-        if candidates := seen.fitting(firmware.BY_VERSION):
+        looks_like_a_can232 = re.fullmatch(firmware.HEX4, version)
+        if not looks_like_a_can232 and (candidates := seen.fitting(firmware.BY_VERSION)):
             (name,) = candidates
             profile = firmware.load(name)
             if profile.serial_number:
                 seen = seen._replace(number=(yield from self._seen(b"N", "tell its serial number")))
             return _recognised(profile, firmware.BY_VERSION[name], seen, closed=False)
-        if not re.fullmatch(firmware.HEX4, version):
+        if not looks_like_a_can232:
             raise self._unknown(seen)
         seen = seen._replace(number=(yield from self._seen(b"N", "tell its serial number")))
         candidates = seen.fitting(firmware.BY_CONSTANTS) or seen.fitting(firmware.BY_ALL_ANSWERS)
