@@ -113,7 +113,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
         parts["may be"] = found["family"] + type_
     if usb and not found["driver"]:
         parts["driver"] = NO_DRIVER
-    parts["used by"] = ", ".join(found["used_by"]) or "nobody"
+    nobody = "nobody" if os.geteuid() == 0 else "none of your programs"
+    parts["used by"] = ", ".join(found["used_by"]) or nobody
     if found["refused"]:
         parts["permission"] = found["refused"]
     head = f"port: {found['port']}" if found["port"] else "no port for a bridge"

@@ -152,6 +152,7 @@ def test_what_cannot_be_known_is_said(
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     shown = text(capsys)
     assert "Bridge pc is not known: no permission for it." in shown
+    assert "used by   none of your programs\n" in shown
     assert listing.ONLY_YOURS in shown
 
 
