@@ -1,8 +1,8 @@
 """Frames a second to the bus of clones on USB that answer each frame, through a link of 1 ms each way.
 
-Prints a table: can-bridge (relay and adapter as they are), python-can's slcan interface, and a writer that only
-counts answers, which is the limit of the simulator, itself a Python program. All write to the same simulated
-device in a process of its own; its CAN bus runs at 1 Mbit/s. ./dev python tests/bench/clones.py
+Prints a table: can-bridge (relay and adapter as they are), python-can's slcan interface, and a writer that
+only counts answers, which is the limit of the simulator, itself a Python program. All write to the same
+simulated device in a process of its own; its CAN bus runs at 1 Mbit/s. ./dev python tests/bench/clones.py
 """
 
 import argparse
@@ -242,9 +242,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=10_000)
     frames = parser.parse_args().frames
-    print(
-        "| device | by | offered/s | on the bus/s | frames | on the bus | told as dropped | lost unsaid | in order |"
-    )
+    print("| device | by | offered/s | on the bus/s | frames | on the bus | told dropped | lost | in order |")
     print("|---|---|--:|--:|--:|--:|--:|--:|---|")
     for family in FAMILIES:
         for name, write, rate in RUNS:
