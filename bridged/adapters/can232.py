@@ -92,6 +92,7 @@ SENT_MEANS = {
     Confirms.ALWAYS: "this firmware confirms also frames that it loses: sent means written to the adapter",
     Confirms.NOTHING: "this firmware does not confirm frames: sent means written to USB",
 }
+ORDER_UNCERTAIN = "; where other nodes keep the bus busy, frames may leave it in another order"
 
 Firmware = Annotated[
     str, Meta(pattern=f"^({'|'.join(firmware.NAMES)})$", description=" or ".join(firmware.NAMES))
@@ -213,7 +214,9 @@ class Can232:
 
     @property
     def sent_means(self) -> str | None:
-        return None if self.profile is None else SENT_MEANS[self.sending.confirms]
+        if self.profile is None:
+            return None
+        return SENT_MEANS[self.sending.confirms] + ("" if self.profile.in_order else ORDER_UNCERTAIN)
 
     @property
     def tells_full(self) -> bool:
@@ -250,7 +253,7 @@ class Can232:
         found = yield from self._recognition.steps(product)
         self.profile = profile = found.profile
         self.identity = self._eeprom.identity = found.identity._replace(firmware=profile.name)
-        self.cautions = profile.warnings
+        self.cautions = profile.cautions
         if self._channel.listen_only and profile.listen_only_warning:
             self.cautions += (profile.listen_only_warning,)
         self.sync = self._ask_version(found.version_prefix)

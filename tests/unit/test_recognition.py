@@ -365,7 +365,7 @@ def test_one_without_flags_is_asked_for_its_version_while_it_runs(
     assert bridge.adapter.profile is profile  # type: ignore[attr-defined]
     assert status["adapter"]["sent_means"] in caplog.messages
     assert [text for text in caplog.messages if "of this adapter: " in text] == [
-        f"of this adapter: {text}" for text in profile.warnings
+        f"of this adapter: {text}" for text in profile.cautions
     ]
     assert status["counters"]["reconnects"] == 0
     assert status["channel_open"] is False

@@ -78,6 +78,12 @@ class Profile(Struct, frozen=True, kw_only=True):
         return f"{'an' if self.title[0] in 'AEIOU' and not self.title.startswith('US') else 'a'} {self.title}"
 
     @property
-    def doubtful(self) -> bool:
-        """No counter of frames that this device got says that it has them."""
-        return self.sending.confirms in {Confirms.ALWAYS, Confirms.NOTHING}
+    def cautions(self) -> tuple[str, ...]:
+        """All that its user must know, whatever the mode."""
+        if self.sending.confirms not in {Confirms.ALWAYS, Confirms.NOTHING}:
+            return self.warnings
+        unseen = (
+            "nothing tells the bridge when no other node acknowledges its frames: "
+            f"up to {self.buffer} wait in its buffer then, however long, and more are lost"
+        )
+        return (*self.warnings, unseen)

@@ -21,7 +21,6 @@ PROFILE = Profile(
     bus_off_flag=7,
     warnings=(
         "closing its channel leaves up to 3 frames in its controller, which it may send when opened again",
-        "frames may leave it in another order where other nodes keep the bus busy",
         "a burst of more than 128 characters loses bytes of received frames",
     ),
 )
