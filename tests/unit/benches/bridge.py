@@ -1,6 +1,7 @@
 """A bridge, relay and adapter on a simulated device behind a real pty; only the interface is a socketpair."""
 
 import contextlib
+import gc
 import json
 import os
 import select
@@ -194,6 +195,8 @@ class ContractBench(Bench):
         super().close()
         for end in self._ends:
             end.close()
+        self._bridges.clear()
+        gc.collect()  # noting the steps ties each bridge, with the descriptors of its relay, in a circle
 
 
 class Usb2canBench(Bench):
