@@ -137,7 +137,8 @@ class Traffic:
         with contextlib.suppress(BlockingIOError):
             while True:
                 self.received.append(unpack(self.bench.bus.far.recv(16)))
-        counters, device = self.bridge.snapshot()["counters"], self.bench.device.counters
+        status, device = self.bridge.snapshot(), self.bench.device.counters
+        counters = status["counters"]
         out = len(self.bench.frames) + counters["tx_dropped"]["remote-frame"] + device.frames_vanished
         here = len(self.received) + device.frames_lost
         with contextlib.suppress(BlockingIOError):
@@ -147,7 +148,8 @@ class Traffic:
         while self._heard < min(len(self.to_host), here + self.family.ahead):
             self.bench.far.send(pack(self.to_host[self._heard]))
             self._heard += 1
-        return out >= len(self.to_device) and here >= len(self.to_host)
+        answered = not status["queued"]
+        return out >= len(self.to_device) and here >= len(self.to_host) and answered
 
 
 def can_send(remote: Remote, frame: Frame) -> bool:
