@@ -10,7 +10,7 @@ from yaml.nodes import MappingNode, Node, ScalarNode
 from bridged.yaml_source import CORE, foreign_tag, is_empty, parse
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from bridged.yaml_source import Problems
 
@@ -38,23 +38,28 @@ def overlay(root: Node | None, settings: Iterable[Setting], problems: Problems, 
             continue
         seen[path] = name
         value = parse(setting.text, problems, name)
-        root = _put(root, path, value or ScalarNode(f"{CORE}null", "", *_marks(name)), name)
+        root = _put(root, setting, value or ScalarNode(f"{CORE}null", "", *_marks(name)), problems)
     return root
 
 
-def _put(node: Node | None, path: Sequence[str], value: Node, name: str) -> Node:
+def _put(node: Node | None, setting: Setting, value: Node, problems: Problems, depth: int = 0) -> Node:
     """A copy of a mapping with the value in its place; what is there and is none stays, for its own error."""
+    name, path = setting.name, setting.path
     if node is None or is_empty(node):  # also `key:` in the file
         node = MappingNode(f"{CORE}map", [], *_marks(name))
-    if not isinstance(node, MappingNode) or foreign_tag(node):
+    if not isinstance(node, MappingNode):
+        if depth:  # at 0 the file is no mapping, and said to be none
+            problems.add(0, 0, f"cannot be set: {'.'.join(path[:depth])} has a value that is no section", name)
         return node
-    key, *rest = path
+    if foreign_tag(node):
+        return node
+    key = path[depth]
     present = [(word, there) for word, there in node.value if word.value == key]
     others = [(word, there) for word, there in node.value if word.value != key]
     word: Node = ScalarNode(f"{CORE}str", key, *_marks(name))
-    if rest:
+    if depth + 1 < len(path):
         old = present[0] if present else (word, None)
-        word, value = old[0], _put(old[1], rest, value, name)
+        word, value = old[0], _put(old[1], setting, value, problems, depth + 1)
     return MappingNode(node.tag, [*others, (word, value)], node.start_mark, node.end_mark)
 
 

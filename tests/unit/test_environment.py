@@ -108,6 +108,9 @@ def test_the_environment_wins(tmp_path: Path, variables: dict[str, str], same_as
           "CAN_BRIDGE__BUS__: names no key; expected CAN_BRIDGE__SECTION__KEY"]),
         ({"CAN_BRIDGE__BUS__CHANNEL": "a", "CAN_BRIDGE__bus__channel": "b"},
          ["CAN_BRIDGE__bus__channel: is the same key as CAN_BRIDGE__BUS__CHANNEL; remove one of them"]),
+        ({"CAN_BRIDGE__CHANNEL__BITRATE__X": "5", "CAN_BRIDGE__NOTIFY": "[a]", "CAN_BRIDGE__NOTIFY__B": "c"},
+         ["CAN_BRIDGE__CHANNEL__BITRATE__X: cannot be set: channel.bitrate has a value that is no section",
+          "CAN_BRIDGE__NOTIFY__B: cannot be set: notify has a value that is no section"]),
         ({"CAN_BRIDGE__HEALTH__INTERVAL": "9", "CAN_BRIDGE__TRANSMIT": "3"},
          ["CAN_BRIDGE__HEALTH__INTERVAL: health.interval: expected a number of seconds from 0.1 to 0.5, got 9",
           "CAN_BRIDGE__TRANSMIT: transmit: expected a section with queue, window, deadline, got 3"]),
@@ -129,7 +132,11 @@ def test_errors_of_the_file_come_first(tmp_path: Path) -> None:
     file = tmp_path / "a.yaml"
     file.write_text(FILE.replace("channel:\n  bitrate: 125000", "channel: 5"))
     problems = problems_of(file, {"CAN_BRIDGE__CHANNEL__BITRATE": "1", "CAN_BRIDGE__BUS__CREATE": "maybe"})
-    assert [problem.partition(": ")[0] for problem in problems] == [f"{file}:2:10", "CAN_BRIDGE__BUS__CREATE"]
+    assert [problem.partition(": ")[0] for problem in problems] == [
+        f"{file}:2:10",
+        "CAN_BRIDGE__BUS__CREATE",
+        "CAN_BRIDGE__CHANNEL__BITRATE",
+    ]
 
 
 def test_what_is_missing_without_a_file(tmp_path: Path) -> None:
