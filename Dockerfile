@@ -58,6 +58,6 @@ ENV PATH=/opt/can-bridge/bin:$PATH \
 VOLUME ["/run/can-bridge", "/var/lib/can-bridge"]
 USER 65532:65532
 # Started, not ready: an adapter that is not plugged in is no reason to hold back or to restart anything.
-HEALTHCHECK --interval=5s --timeout=5s --start-period=10s CMD ["can-bridge", "status", "--check", "started"]
+HEALTHCHECK --interval=5s --timeout=7s --start-period=10s CMD ["can-bridge", "status", "--check", "started"]
 ENTRYPOINT ["can-bridge"]
 CMD ["run", "/etc/can-bridge/can-bridge.yaml"]

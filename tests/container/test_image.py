@@ -13,6 +13,8 @@ from container.conftest import REPOSITORY, UNPRIVILEGED, Image
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
+from bridged.daemon.status import ANSWER_TIMEOUT_S
+
 SIZE_MAX = 60_000_000  # bytes above the base: Python, can-bridge, what it needs
 CHECK_MAX_S = 0.15  # of processor time: a probe asks every few seconds
 STOP_MAX_S = 2
@@ -37,6 +39,7 @@ def test_configuration(image: Image) -> None:
     assert set(config["Volumes"]) == {"/run/can-bridge", "/var/lib/can-bridge"}
     # Started, not ready: whoever waits for a healthy container must not wait for an adapter to be plugged in.
     assert found["Healthcheck"]["Test"] == ["CMD", "can-bridge", "status", "--check", "started"]
+    assert found["Healthcheck"]["Timeout"] > ANSWER_TIMEOUT_S * 1e9  # so that it can say why
     labels = {key.removeprefix("org.opencontainers.image."): value for key, value in found["Labels"].items()}
     assert labels["title"] == "can-bridge"
     assert labels["licenses"] == "MIT"

@@ -11,6 +11,7 @@ import yaml
 from container.manifests import CONFIGURATION, DIRECTORY, MANIFESTS
 
 from bridged.config import check
+from bridged.daemon.status import ANSWER_TIMEOUT_S
 
 PODS = sorted(name for name in MANIFESTS if name != "compose.yaml")
 COMPOSE = DIRECTORY / "compose.yaml"
@@ -60,6 +61,14 @@ def test_only_who_makes_the_interface_has_a_capability(name: str) -> None:
     privileged = [one["name"] for one in containers if "add" in one["securityContext"]["capabilities"]]
     assert privileged == ["interface"]
     assert all(one["securityContext"]["capabilities"]["drop"] == ["ALL"] for one in containers)
+
+
+@pytest.mark.parametrize("name", [name for name in PODS if name.startswith("kubernetes")])
+def test_a_probe_has_the_time_to_say_why(name: str) -> None:
+    """`status` gives up by itself, with a line that names the reason; kubelet must not end it before."""
+    (bridge,) = (one for one in pod(name)["spec"]["initContainers"] if one["name"] == "bridge")
+    for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
+        assert bridge[probe]["timeoutSeconds"] > ANSWER_TIMEOUT_S
 
 
 @pytest.mark.parametrize("name", MANIFESTS)
