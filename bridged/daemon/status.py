@@ -76,7 +76,7 @@ def own_socket_path(name: str) -> Path:
 def running_sockets() -> list[Path]:
     """The status sockets there are, of this user's bridges and of root's."""
     folders = directories.runtime_directories()
-    return sorted(path for folder in folders for path in directories.status_sockets(folder))
+    return sorted({path for folder in folders for path in directories.status_sockets(folder)})
 
 
 class StatusServer:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from bridged.daemon import directories
+from bridged.daemon.status import running_sockets
 
 
 def test_where_the_status_sockets_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -39,6 +40,16 @@ def test_sockets_by_hand_and_of_the_service(tmp_path: Path) -> None:
     assert {directories.runtime_directory_of(path) for path in directories.status_sockets(tmp_path)} == {
         tmp_path
     }
+
+
+def test_a_socket_that_two_directories_show_is_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As in the image: XDG_RUNTIME_DIR is root's directory, and the bridge has the name of its own directory there."""
+    own = tmp_path / "can-bridge"
+    own.mkdir()
+    socket = own / "can-bridge.sock"
+    socket.touch()
+    monkeypatch.setattr(directories, "runtime_directories", lambda: {tmp_path, own})
+    assert running_sockets() == [socket]
 
 
 def test_where_the_state_is(monkeypatch: pytest.MonkeyPatch) -> None:
