@@ -116,7 +116,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
     nobody = "nobody" if os.geteuid() == 0 else "none of your programs"
     parts["used by"] = ", ".join(found["used_by"]) or nobody
     if found["refused"]:
-        parts["permission"] = found["refused"]
+        parts["refused"] = found["refused"]
     head = f"port: {found['port']}" if found["port"] else "no port for a bridge"
     return [head, *(f"  {name:<{LABEL - 2}}{text}" for name, text in parts.items())]
 

@@ -63,6 +63,14 @@ def test_as_a_user_reads_it(
     )
 
 
+def test_why_a_port_cannot_be_opened(machine: FakeMachine, capsys: pytest.CaptureFixture[str]) -> None:
+    """As in a container without the host's /dev; under a label that leaves a space."""
+    machine.add_uart("ttyS0", 4)
+    (machine.dev / "ttyS0").unlink()
+    (line,) = (line for line in text(capsys).splitlines() if "there is no" in line)
+    assert line.startswith("  refused   there is no ")
+
+
 def test_as_a_program_reads_it(machine: FakeMachine, capsys: pytest.CaptureFixture[str]) -> None:
     machine.plug("3-1", "16d0:117e", ttys={0: "ttyACM0"}, driver="cdc_acm", product="CANable2 b158aa7 x")
     node = str(machine.dev / "ttyACM0")
