@@ -79,7 +79,7 @@ def _existing(name: str) -> Path:
         found = next((str(file) for file in near if file.is_file()), None)
         if found is None and path.parent == CONFIG_DIRECTORY:
             found = ", ".join(sorted(file.stem for file in CONFIG_DIRECTORY.glob("*.yaml")))
-        there = f"; there is {found}" if found else ""
+        there = f"; there is {found}" if found else ", and no environment variable CAN_BRIDGE__SECTION__KEY"
         raise ConfigError([f"{path}: there is no such file{there}"]) from None
     except OSError:  # reading says why
         pass

@@ -127,6 +127,17 @@ def test_the_file_that_is_meant(
     assert message.endswith(f": there is no such file; there is {there.format(etc=etc)}\n")
 
 
+@pytest.mark.parametrize("command", ["run", "interface"])
+def test_no_configuration_at_all(etc: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    """As a container's first start: both ways to give one are named."""
+    for file in etc.iterdir():
+        file.unlink()
+    assert cli.main([command]) == 78
+    assert capsys.readouterr().err == (
+        f"{etc}/can-bridge.yaml: there is no such file, and no environment variable CAN_BRIDGE__SECTION__KEY\n"
+    )
+
+
 def test_who_may_not_read_it(
     etc: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
