@@ -40,7 +40,7 @@ RUN apt-get update \
         /var/lib/apt/lists/* /var/cache/apt/* /var/cache/debconf/*-old /var/lib/dpkg/*-old /var/log/apt /var/log/*.log \
     && echo 'can-bridge:x:65532:' >> /etc/group \
     && echo 'can-bridge:x:65532:65532::/nonexistent:/usr/sbin/nologin' >> /etc/passwd \
-    && install -d -o 65532 -g 65532 /run/can-bridge /var/lib/can-bridge
+    && install -d -m 1777 /run/can-bridge /var/lib/can-bridge
 COPY --from=build /opt/can-bridge /opt/can-bridge
 
 ARG VERSION=0.1.0
@@ -50,7 +50,8 @@ LABEL org.opencontainers.image.title="can-bridge" \
     org.opencontainers.image.licenses="MIT"
 
 # The status socket, and what is known of the adapters' EEPROM: the two places that are written to, so that the root
-# file system can be read-only. The bridge makes a directory of its own in each, whoever owns what is mounted there.
+# file system can be read-only. The bridge makes a directory of its own in each, whoever owns what is mounted there,
+# and whatever user it runs as: /tmp's mode.
 ENV PATH=/opt/can-bridge/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     XDG_RUNTIME_DIR=/run/can-bridge \

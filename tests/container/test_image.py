@@ -103,6 +103,13 @@ print(status, used.ru_utime + used.ru_stime)
 """
 
 
+def wait_for_log(image: Image, container: str, text: str) -> None:
+    deadline = time.monotonic() + 20
+    while text not in image.logs(container):
+        assert time.monotonic() < deadline, image.logs(container)
+        time.sleep(0.1)
+
+
 @pytest.fixture
 def waiting(image: Image, tmp_path: Path) -> Iterator[str]:
     """A container whose adapter is not there and that may do nothing."""
@@ -112,11 +119,22 @@ def waiting(image: Image, tmp_path: Path) -> Iterator[str]:
         "run", "-d", *UNPRIVILEGED, "-v", f"{tmp_path}:/etc/can-bridge:ro", image.name
     )  # fmt: skip
     try:
-        deadline = time.monotonic() + 20
-        while "state=waiting" not in image.logs(name):
-            assert time.monotonic() < deadline, image.logs(name)
-            time.sleep(0.1)
+        wait_for_log(image, name, "state=waiting")
         yield name
+    finally:
+        image.podman("rm", "-f", "-v", name)
+
+
+def test_any_other_user(image: Image, tmp_path: Path) -> None:
+    """As `--user` or a platform that gives each project a number says; without a volume that is made for it."""
+    (tmp_path / "can-bridge.yaml").write_text(CONFIG)
+    tmp_path.chmod(0o755)
+    volume = f"{tmp_path}:/etc/can-bridge:ro"
+    name = image.podman("run", "-d", *UNPRIVILEGED, "--user", "1234:0", "-v", volume, image.name)
+    try:
+        wait_for_log(image, name, "state=waiting")
+        image.podman("exec", name, "can-bridge", "status", "--check", "started")
+        image.podman("exec", name, "sh", "-c", "mkdir /var/lib/can-bridge/can-bridge")
     finally:
         image.podman("rm", "-f", "-v", name)
 
