@@ -127,6 +127,7 @@ def _run(args: argparse.Namespace) -> int:
 
     mounted = None if args.settings else MountedConfig(config_path(args.config or DEFAULT_NAME))
     config = _given(args)
+    from_file = config.path.exists()
     port_opener = _port_opener(args, config)
     open_interface = _opened_as(args.user, config.bus) if args.user else open_interface
     notifier = systemd_notifier()
@@ -143,9 +144,7 @@ def _run(args: argparse.Namespace) -> int:
     memory = FileMemory(state_directory())
 
     def successor(present: Config) -> Bridge | None:
-        if args.settings:
-            raise ConfigError(["there is no file to read again, the options hold: start the bridge anew"])
-        fresh = _given(args)
+        fresh = _given_anew(args, from_file=from_file)
         return None if fresh == present else Bridge(fresh, memory, open_port=port_opener(fresh))
 
     def snapshot() -> dict[str, Any]:
@@ -180,6 +179,17 @@ def _given(args: argparse.Namespace) -> Config:
             raise ConfigError([f"{text}change the file, or name the interface instead"])
         settings.append(Setting("INTERFACE", ("bus", "channel"), args.config))
     return load_options(settings, os.environ)
+
+
+def _given_anew(args: argparse.Namespace, *, from_file: bool) -> Config:
+    """The configuration for a reload; `from_file`: the first one was, maybe with variables laid over it."""
+    if args.settings:
+        raise ConfigError(["there is no file to read again, the options hold: start the bridge anew"])
+    config = _given(args)
+    if from_file and not config.path.exists():
+        # The variables alone may be a whole configuration, but without what only the file says: listen_only.
+        raise ConfigError([f"{config.path}: there is no such file any more"])
+    return config
 
 
 def _port_opener(args: argparse.Namespace, config: Config) -> Callable[[Config], Callable[[str, int], Port]]:

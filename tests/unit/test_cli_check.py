@@ -1,11 +1,13 @@
 """can-bridge check: what it warns of, which files it takes."""
 
+import argparse
 from pathlib import Path
 
 import pytest
 
 from bridged import cli
 from bridged.config import check
+from bridged.errors import ConfigError
 
 GOOD = "adapter: {type: can232, port: /dev/ttyUSB0}\nchannel: {bitrate: 125000}\nbus: {channel: vcan0}\n"
 
@@ -136,6 +138,21 @@ def test_no_configuration_at_all(etc: Path, capsys: pytest.CaptureFixture[str], 
     assert capsys.readouterr().err == (
         f"{etc}/can-bridge.yaml: there is no such file, and no environment variable CAN_BRIDGE__SECTION__KEY\n"
     )
+
+
+def test_a_reload_does_not_go_on_without_the_file(etc: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the variables would do alone: the bridge was listen-only by the file."""
+    monkeypatch.setenv("CAN_BRIDGE__ADAPTER", "{type: can232, port: /dev/ttyUSB0}")
+    monkeypatch.setenv("CAN_BRIDGE__CHANNEL__BITRATE", "125000")
+    monkeypatch.setenv("CAN_BRIDGE__BUS__CHANNEL", "vcan0")
+    file = etc / "mine.yaml"
+    file.write_text("channel: {listen_only: true}\n")
+    args = argparse.Namespace(config=str(file), settings=[])
+    assert cli._given_anew(args, from_file=True).channel.listen_only
+    file.unlink()
+    with pytest.raises(ConfigError, match=r"mine\.yaml: there is no such file any more"):
+        cli._given_anew(args, from_file=True)
+    assert not cli._given_anew(args, from_file=False).channel.listen_only  # there never was one
 
 
 def test_who_may_not_read_it(
