@@ -49,7 +49,8 @@ def _put(node: Node | None, setting: Setting, value: Node, problems: Problems, d
         node = MappingNode(f"{CORE}map", [], *_marks(name))
     if not isinstance(node, MappingNode):
         if depth:  # at 0 the file is no mapping, and said to be none
-            problems.add(0, 0, f"cannot be set: {'.'.join(path[:depth])} has a value that is no section", name)
+            section = ".".join(path[:depth])
+            problems.add(0, 0, f"cannot be set: {section} has a value that is no section", name)
         return node
     if foreign_tag(node):
         return node

@@ -126,7 +126,7 @@ def waiting(image: Image, tmp_path: Path) -> Iterator[str]:
 
 
 def test_any_other_user(image: Image, tmp_path: Path) -> None:
-    """As `--user` or a platform that gives each project a number says; without a volume that is made for it."""
+    """As `--user` or a platform with a number for each project says; without a volume made for it."""
     (tmp_path / "can-bridge.yaml").write_text(CONFIG)
     tmp_path.chmod(0o755)
     volume = f"{tmp_path}:/etc/can-bridge:ro"

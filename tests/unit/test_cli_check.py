@@ -136,7 +136,8 @@ def test_no_configuration_at_all(etc: Path, capsys: pytest.CaptureFixture[str], 
         file.unlink()
     assert cli.main([command]) == 78
     assert capsys.readouterr().err == (
-        f"{etc}/can-bridge.yaml: there is no such file, and no environment variable CAN_BRIDGE__SECTION__KEY\n"
+        f"{etc}/can-bridge.yaml: there is no such file, "
+        "and no environment variable CAN_BRIDGE__SECTION__KEY\n"
     )
 
 

@@ -43,7 +43,7 @@ def test_sockets_by_hand_and_of_the_service(tmp_path: Path) -> None:
 
 
 def test_a_socket_that_two_directories_show_is_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """As in the image: XDG_RUNTIME_DIR is root's directory, and the bridge has the name of its own directory there."""
+    """As in the image: XDG_RUNTIME_DIR is root's directory, and a bridge is called as its own in there."""
     own = tmp_path / "can-bridge"
     own.mkdir()
     socket = own / "can-bridge.sock"
