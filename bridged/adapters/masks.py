@@ -48,8 +48,8 @@ class Mask(Protocol):
 
 _END: Final = re.compile(rb"[\r\a]")
 _DIGIT: Final = re.compile(rb"[0-9A-Fa-f]")
-# At its beginning a line may also be a CAN FD frame of some clones; within a line b and d are digits.
-_FRAME: Final = re.compile(rb"(^[bdBD](?=[0-9A-Fa-f]{4})|[tTrR])([0-9A-Fa-f]*)([^tTrR]*)")
+# A line of digits may also be a CAN FD frame of some clones. `b158aa7 https://…` is none, but a version.
+_FRAME: Final = re.compile(rb"(^[bdBD](?=[0-9A-Fa-f]{4,}\r)|[tTrR])([0-9A-Fa-f]*)([^tTrR]*)")
 _ACCEPTANCE: Final = re.compile(rb"[Mm][0-9A-Fa-f]{8}\r")
 _FIRST: Final = frozenset(b"tTrRbBdDmM")
 _LONGEST: Final = 1 + 8 + 1 + 128 + 8 + 1  # T, identifier, DLC, data of a CAN FD frame, time stamp, CR
@@ -97,7 +97,8 @@ class LineMask:
     def _mask(self, line: bytes) -> bytes:
         if _ACCEPTANCE.fullmatch(line):
             return _DIGIT.sub(b"0", line)
-        return _FRAME.sub(self._mask_frame, line)
+        first = _FRAME.match(line)
+        return _FRAME.sub(self._mask_frame, line) if first and first[2] else line
 
     def _mask_frame(self, match: re.Match[bytes]) -> bytes:
         letter, digits, rest = match.groups()

@@ -29,6 +29,7 @@ SIMULATORS: Final = {
     "slcanuino": "bridged.simulators.slcanuino",
     "usbtin": "bridged.simulators.usbtin",
     "weact": "bridged.simulators.weact",
+    "replay": "bridged.simulators.replay",
 }
 """ADAPTER in `can-bridge simulate ADAPTER` → its module, loaded only when it is needed."""
 

@@ -60,7 +60,9 @@ def of_message(raw: bytes) -> Frame:
 
 
 FLUSH, NOISE = b"V" * 200, b"\x0f\xff\x11"
-LINES = b"\r \a z\r Z\r V1013\r NA123\r F00\r S6\r A\r Tiny_2_CAN\r b158_https://github.com\r".split(b" ")
+LINES = b"\r \a z\r Z\r V1013\r NA123\r F00\r S6\r A\r Tiny_2_CAN\r b158aa7_https://github.com/normaldotcom/canable-fw.git\r".split(
+    b" "
+)
 MESSAGES = [
     b"\xff\xff",
     message(33, b"HW0003FW0016"),
@@ -132,6 +134,7 @@ def test_frames_become_others_of_their_kind_and_the_rest_stays(type_: str, seed:
         ("can232", b"t12", b"t00"),  # the rest is lost
         ("can232", b"T0012\xf2ABC\r", b"T0000\xf2000\r"),
         ("can232", b"t" + b"12" * 100 + b"34\r", b"t" + b"00" * 100 + b"00\r"),
+        ("can232", b"b12", b"b12"),  # no frame
         ("can232", b"M12345678\rmFFFFFFFF\rM1\r", b"M00000000\rm00000000\rM1\r"),
         ("usb2can", bytes.fromhex("0F41 05 0224"), bytes.fromhex("0F41 05 0000")),
         ("usb2can", bytes.fromhex("0F41 02 0224"), bytes.fromhex("0F41 02 0200")),  # too short for a frame
@@ -150,6 +153,14 @@ def test_a_line_that_lost_its_end_hides_the_next_frame_too() -> None:
     mask = MASKS["can232"](ids := MaskedIds())
     standard, extended = ids.standard(0x123), ids.extended(0x12345678)
     assert mask.feed(b"t1232AT1234567810F\r") == b"t%03X20T%08X100\r" % (standard, extended)
+
+
+def test_frames_of_can_fd() -> None:
+    mask = MASKS["can232"](ids := MaskedIds())
+    standard, extended = ids.standard(0x123), ids.extended(0x12345678)
+    assert mask.feed(b"d1239" + b"AB" * 12 + b"\rB123456780\r") == b"d%03X9" % standard + b"00" * 12 + (
+        b"\rB%08X0\r" % extended
+    )
 
 
 def test_every_standard_identifier_becomes_another() -> None:

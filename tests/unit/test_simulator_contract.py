@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from benches.simulating import OPTIONS
 
 from bridged import cli
 from bridged.adapters import TYPES
@@ -24,7 +25,7 @@ def members(protocol: type) -> set[str]:
 
 def test_it_has_all_that_the_contract_asks_for(name: str) -> None:
     module = simulator(name)
-    device = make_device(name)
+    device = make_device(name, OPTIONS.get(name, ()))
     assert members(SimulatorModule) - set(dir(module)) == set()
     assert members(Device) - set(dir(device)) == set()
     assert device.own_faults is module.FAULTS
@@ -33,12 +34,12 @@ def test_it_has_all_that_the_contract_asks_for(name: str) -> None:
 
 
 def test_it_is_made_at_its_uart_rate(name: str) -> None:
-    uart = getattr(make_device(name, uart_rate=38_400), "uart", None)
+    uart = getattr(make_device(name, OPTIONS.get(name, ()), uart_rate=38_400), "uart", None)
     assert uart is None or uart.baud == 38_400
 
 
 def test_every_fault_comes_and_goes(name: str) -> None:
-    device = make_device(name, now=0.0)
+    device = make_device(name, OPTIONS.get(name, ()), now=0.0)
     for kind in meanings(device.own_faults):
         fault = parse_fault(f"{kind}@0+1", meanings(device.own_faults))
         action = repeated(device, fault, random.Random(0))
@@ -55,7 +56,7 @@ def test_every_fault_comes_and_goes(name: str) -> None:
 
 
 def test_no_power_is_no_service(name: str) -> None:
-    device = make_device(name, now=0.0)
+    device = make_device(name, OPTIONS.get(name, ()), now=0.0)
     begin(device, Fault("poweroff", 0, 1), 1.0)
     device.host_writes(1.0, b"V\r\x0f\x21\x00")
     device.bus_frame(1.0, Frame(0x100, False, False, 0, b""))
@@ -74,9 +75,10 @@ def test_every_fault_is_explained(name: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_no_other_simulator_is_loaded(name: str) -> None:
+    command = ["simulate", name, *OPTIONS.get(name, ())]
     code = (
         "import sys; from bridged import cli; from bridged.simulators import SIMULATORS\n"
-        f"cli._parser(['simulate', {name!r}]).parse_args(['simulate', {name!r}])\n"
+        f"cli._parser({command}).parse_args({command})\n"
         "print(*(name for name, module in SIMULATORS.items() if module in sys.modules))"
     )
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()

@@ -129,6 +129,7 @@ class Bench:
             if not bridge.finished:
                 bridge.abort()
                 bridge.close()
+        self._bridges.clear()  # who refer to this: their descriptors would wait for the garbage collector
         self.pull_out()
         self.bus.close()
         self.bus.far.close()
@@ -150,7 +151,14 @@ class ContractBench(Bench):
     def plug_in(self, device: Device, **options: Any) -> None:
         super().plug_in(device, bus=self._ends[0], **options)
 
-    def bridge(self, *, bitrate: int = 500_000, deadline_s: float = LIMIT_S, **_options: object) -> Bridge:
+    def bridge(
+        self,
+        *,
+        bitrate: int = 500_000,
+        deadline_s: float = LIMIT_S,
+        health_s: float = 0.1,
+        **_options: object,
+    ) -> Bridge:
         """One after the other, each with an interface of its own. Steps that are asked for are in `asked`."""
         self.bus.close()
         self.bus.far.close()
@@ -161,7 +169,7 @@ class ContractBench(Bench):
         config = {
             "adapter": {**adapter, "port": str(self.link), **serial},
             "channel": {"bitrate": bitrate},
-            "health": {"interval": 0.1},
+            "health": {"interval": health_s},
             "bus": {"channel": "vcan0"},
             "reconnect": {"initial": 0.01, "maximum": 0.01},
             "transmit": {"deadline": deadline_s},

@@ -11,7 +11,7 @@ from bridged.simulators.slcan import Slcan
 
 CAN232 = "can232"
 DEAF = {"usb2can", "cantact"}  # another protocol; answers nothing
-FAMILIES = tuple(sorted(SIMULATORS.keys() - DEAF - {CAN232}))
+FAMILIES = tuple(sorted(SIMULATORS.keys() - DEAF - {CAN232, "replay"}))
 OF_ANOTHER_FAMILY = {"nakakiyo-fd": ("nakakiyo", "VW1K2")}
 FRAME = Frame(0x123, False, False, 2, b"\xaa\xbb")
 REMOTE = Frame(0x123, False, True, 2, b"")

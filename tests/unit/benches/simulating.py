@@ -18,6 +18,8 @@ from bridged.simulators.faults import meanings, parse_fault
 from bridged.simulators.serve import Simulator
 
 TIMEOUT_S = 20
+# What a simulator cannot do without, in the command line.
+OPTIONS = {"replay": [str(Path(__file__).parents[2] / "golden/captures/can232.txt")]}
 # A USB2CAN, from its power-up to frames at 1 Mbit/s, and what it answers to that.
 _PASS_ALL = b"".join(b"\x0f\x12\x02" + bytes((16 + n, 0 if n < 4 else 0xFF)) for n in range(8))
 START = (
