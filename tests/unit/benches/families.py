@@ -37,10 +37,10 @@ class Family(NamedTuple):
 FAMILIES = {
     "canable1": Family("canable1", "canable1", ahead=1, bitrate=SLOW),
     "canable2": Family("canable2", "canable2", bitrate=SLOW),
-    "nakakiyo": Family("nakakiyo", "nakakiyo"),
-    "nakakiyo-vw1k": Family("nakakiyo", "nakakiyo", ("--version", "VW1K2")),
+    "nakakiyo": Family("nakakiyo", "nakakiyo", bitrate=125_000),
+    "nakakiyo-vw1k": Family("nakakiyo", "nakakiyo", ("--version", "VW1K2"), bitrate=125_000),
     "weact": Family("weact", "weact", ahead=8),
-    "elmue": Family("elmue", "elmue"),
+    "elmue": Family("elmue", "elmue", bitrate=125_000),
     "usbtin": Family("usbtin", "usbtin", ahead=4),
     "esp32": Family("esp32", "esp32", ahead=5),
     "slcanuino": Family("slcanuino", "slcanuino", ahead=2),
@@ -139,7 +139,7 @@ class Traffic:
                 self.received.append(unpack(self.bench.bus.far.recv(16)))
         status, device = self.bridge.snapshot(), self.bench.device.counters
         counters = status["counters"]
-        out = len(self.bench.frames) + counters["tx_dropped"]["remote-frame"] + device.frames_vanished
+        out = len(self.bench.frames) + sum(counters["tx_dropped"].values()) + device.frames_vanished
         here = len(self.received) + device.frames_lost
         with contextlib.suppress(BlockingIOError):
             while self._fed < min(len(self.to_device), out + BACKLOG):
