@@ -317,6 +317,21 @@ class TestProbes:
         assert done.stdout == "can232: live, running\nset()\n"
 
 
+def test_a_stop_before_the_start_is_heard(tmp_path: Path) -> None:
+    """Process 1 of a container never gets a SIGTERM that it has no handler for: it would go on."""
+    file = tmp_path / "a.yaml"
+    file.write_text(CONFIG)
+    script = (
+        "import os, signal, sys; from bridged import cli; "
+        "cli._given = lambda _: os.kill(os.getpid(), signal.SIGTERM); "
+        "sys.exit(cli.main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script, "run", str(file)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 class TestPipes:
     def can_bridge(
         self, *arguments: str, redirect: str, **environment: str
