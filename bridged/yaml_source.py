@@ -107,7 +107,7 @@ def read_text(path: Path, problems: Problems) -> str:
     except OSError as error:
         from bridged.text import user_name  # noqa: PLC0415 - only for a file that cannot be read
 
-        by = f" (by user {user_name(os.geteuid())})" if isinstance(error, PermissionError) else ""
+        by = f" (as {user_name(os.geteuid())})" if isinstance(error, PermissionError) else ""
         raise ConfigError([f"{path}: cannot be read: {error.strerror or error}{by}"]) from error
     if len(data) > MAX_BYTES:
         raise ConfigError([f"{path}: is larger than {MAX_BYTES} bytes: not a configuration"])

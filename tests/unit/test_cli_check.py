@@ -156,16 +156,17 @@ def test_a_reload_does_not_go_on_without_the_file(etc: Path, monkeypatch: pytest
     assert not cli._given_anew(args, from_file=False).channel.listen_only  # there never was one
 
 
+@pytest.mark.parametrize(("uid", "name"), [(65534, "nobody"), (61234, "user 61234")])
 def test_who_may_not_read_it(
-    etc: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    etc: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], uid: int, name: str
 ) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("os.geteuid", lambda: 65534)
+    monkeypatch.setattr("os.geteuid", lambda: uid)
     monkeypatch.setattr(Path, "open", refuse)
     assert cli.main(["check", "a"]) == 78
-    assert capsys.readouterr().err == f"{etc}/a.yaml: cannot be read: Permission denied (by user nobody)\n"
+    assert capsys.readouterr().err == f"{etc}/a.yaml: cannot be read: Permission denied (as {name})\n"
 
 
 def test_the_environment(
