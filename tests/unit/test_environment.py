@@ -106,6 +106,8 @@ def test_the_environment_wins(tmp_path: Path, variables: dict[str, str], same_as
         ({"CAN_BRIDGE__BUS__": "x", "CAN_BRIDGE__": "y"},
          ["CAN_BRIDGE__: names no key; expected CAN_BRIDGE__SECTION__KEY",
           "CAN_BRIDGE__BUS__: names no key; expected CAN_BRIDGE__SECTION__KEY"]),
+        ({"CAN_BRIDGE_CHANNEL__LISTEN_ONLY": "true", "CAN_BRIDGE_PORT": "tcp://10.0.0.1:80"},
+         ["CAN_BRIDGE_CHANNEL__LISTEN_ONLY: has one underscore too few; CAN_BRIDGE__CHANNEL__LISTEN_ONLY is probably meant"]),
         ({"CAN_BRIDGE__BUS__CHANNEL": "a", "CAN_BRIDGE__bus__channel": "b"},
          ["CAN_BRIDGE__bus__channel: is the same key as CAN_BRIDGE__BUS__CHANNEL; remove one of them"]),
         ({"CAN_BRIDGE__CHANNEL__BITRATE__X": "5", "CAN_BRIDGE__NOTIFY": "[a]", "CAN_BRIDGE__NOTIFY__B": "c"},
