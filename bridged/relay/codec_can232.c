@@ -78,9 +78,12 @@ static bool is_hex(const uint8_t *in, size_t n)
 }
 
 /* What follows the data, up to the CR: "" 0, "4D67" 4, "0001E240" 8 digits; -1 when it is anything else. */
-static int stamp_measure(const uint8_t *in, size_t n)
+static int stamp_measure(const struct codec_state *state, const uint8_t *in, size_t n)
 {
-    for (size_t digits = 0; digits <= STAMP_MAX; digits += STAMP_STEP) {
+    if (n > 0 && in[0] == CR)
+        return 0;
+    size_t longest = state->short_stamps ? STAMP_STEP : STAMP_MAX;
+    for (size_t digits = 0; digits <= longest; digits += STAMP_STEP) {
         if (n <= digits)
             return -1;
         if (in[digits] == CR)
@@ -119,14 +122,12 @@ static size_t frame_decode(const struct codec_state *state, const uint8_t *in, s
     size_t body = head + 2 * data_len;
     if (n < body)
         return 0;
-    int stamp_digits = stamp_measure(in + body, n - body);
-    unsigned int longest = state->short_stamps ? STAMP_STEP : STAMP_MAX;
-    if ((unsigned int)stamp_digits > longest && remote && n - body > 2 * (size_t)len
-        && is_hex(in + body, 2 * (size_t)len)) {
+    int stamp_digits = stamp_measure(state, in + body, n - body);
+    if (stamp_digits < 0 && remote && n - body > 2 * (size_t)len && is_hex(in + body, 2 * (size_t)len)) {
         body += 2 * (size_t)len;
-        stamp_digits = stamp_measure(in + body, n - body);
+        stamp_digits = stamp_measure(state, in + body, n - body);
     }
-    if ((unsigned int)stamp_digits > longest) /* also where it is -1 */
+    if (stamp_digits < 0)
         return 0;
 
     struct can_frame found;
