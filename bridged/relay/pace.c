@@ -26,6 +26,7 @@ void pace_set(struct pace *p, const struct sending_settings *set)
 void pace_reset(struct pace *p)
 {
     p->depth = 0;
+    p->unanswered = 0;
 }
 
 /* The bits of a frame as they go over the bus: ISO 11898-1, 10.5 (bit stuffing), 10.4.2.6 (CRC). */
@@ -76,13 +77,28 @@ static uint32_t frame_bits(const struct can_frame *frame)
     return b.count + DELIMITERS_ACK_END_PAUSE;
 }
 
-/* Whether there is room in the device's buffer, by our reckoning. */
-bool pace_room(struct pace *p, int64_t now)
+/* Takes those out that have left the device, by our reckoning. What it has not answered may still come: the line may
+ * have held it up. */
+static void look_for_gone(struct pace *p, int64_t now)
 {
-    while (p->count && p->ends[p->head] + p->others_ns <= now) {
+    while (p->count > p->unanswered && p->ends[p->head] + p->others_ns <= now) {
         p->head = place(p, 1);
         p->count--;
     }
+}
+
+/* Whether a frame may go now, where frames are paced. `unanswered`: so many are in flight; 0 where none is answered.
+ * The oldest that was answered since the last look had just reached the device, and those behind it came after it. */
+bool pace_open(struct pace *p, uint32_t unanswered, int64_t now)
+{
+    if (unanswered < p->unanswered && p->count) {
+        uint32_t oldest = p->count > p->unanswered ? p->count - p->unanswered : 0;
+        int64_t end = p->ends[place(p, oldest)] + p->others_ns;
+        if (end < now)
+            p->others_ns += now - end;
+    }
+    p->unanswered = unanswered;
+    look_for_gone(p, now);
     return p->count < p->depth;
 }
 
@@ -101,21 +117,23 @@ void pace_sent(struct pace *p, const struct can_frame *frame, int64_t now)
 {
     int64_t end = pace_start(p, now) + frame_bits(frame) * p->bit_ns;
     p->ends[place(p, p->count++)] = end - p->others_ns;
+    p->unanswered += !p->latency_ns;
 }
 
 /* Somebody else sent a frame. */
 void pace_heard(struct pace *p, const struct can_frame *frame, int64_t now)
 {
-    pace_room(p, now);
+    look_for_gone(p, now);
     if (p->count)
         p->others_ns += frame_bits(frame) * p->bit_ns;
 }
 
 /* When frames may go again, where there is no room now. Not for each: while the device has enough to send, some go
- * together. */
+ * together. NEVER: not before it answers. */
 int64_t pace_deadline(const struct pace *p)
 {
     if (!p->depth || p->count < p->depth)
         return NEVER;
-    return p->ends[place(p, p->count - p->depth + p->depth / 4)] + p->others_ns;
+    uint32_t i = p->count - p->depth + p->depth / 4;
+    return i + p->unanswered < p->count ? p->ends[place(p, i)] + p->others_ns : NEVER;
 }

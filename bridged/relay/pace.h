@@ -13,21 +13,16 @@ struct pace {
     int64_t others_ns;   /* for how long others had the bus while our frames waited */
     int64_t ends[DEPTH_MAX]; /* ring: when each frame in the buffer will have left it, less others_ns */
     uint32_t head, count;
+    uint32_t unanswered; /* the youngest of them: whether these have reached the device is not known */
 };
 
 void pace_set(struct pace *p, const struct sending_settings *set);
 void pace_reset(struct pace *p);
-bool pace_room(struct pace *p, int64_t now);
+bool pace_open(struct pace *p, uint32_t unanswered, int64_t now);
 int64_t pace_start(const struct pace *p, int64_t now);
 void pace_sent(struct pace *p, const struct can_frame *frame, int64_t now);
 void pace_heard(struct pace *p, const struct can_frame *frame, int64_t now);
 int64_t pace_deadline(const struct pace *p);
-
-/* Whether a frame may go now. */
-static inline bool pace_open(struct pace *p, int64_t now)
-{
-    return !p->depth || pace_room(p, now);
-}
 
 /* When a frame that is sent now leaves the device, as far as that is reckoned. */
 static inline int64_t pace_leaves(const struct pace *p, int64_t now)

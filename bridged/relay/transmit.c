@@ -316,7 +316,7 @@ static bool frame_ready(const struct transmit *t, int64_t now)
 {
     if (t->line->silent || !queue_waiting(t->queue) || t->line->inflight_count >= t->line->frames_max)
         return false;
-    if (!pace_open(t->pace, now))
+    if (t->pace->depth && !pace_open(t->pace, t->line->unconfirmed ? 0 : t->line->inflight_count, now))
         return false;
     return t->answers_each ? ack_window_open(t->ack, now) : level_window_open(t->level);
 }

@@ -101,6 +101,27 @@ def test_a_device_on_usb_that_answers_each_frame_gets_3000_a_second(load: float)
         rig.close()
 
 
+@pytest.mark.parametrize("stall_ms", [3, 8, 30])
+def test_a_link_that_stalls_does_not_fill_the_device(stall_ms: int) -> None:
+    """What was held up on its way arrives at once: it counts from then on, and nothing is ever refused."""
+    frames, bitrate = 3000, 1_000_000
+    sending = Sending(Confirms.QUEUED, window=32, paced_bitrate=bitrate, depth=56)
+    rig = Queued(sending=sending, bitrate=bitrate, room=64, slow=0.005, link_ns=1 * MS)
+    try:
+        begin = rig.now
+        for at in range(20, 400, 70):
+            rig.stalls.append((begin + at * MS, begin + (at + stall_ms) * MS))
+        for number in range(frames):
+            rig.bus.send(can_frame(number))
+            rig.turn_and_link()
+        rig.run(begin + S)
+        counters = rig.counters()
+        assert rig.sent == [can_frame(number) for number in range(frames)]
+        assert (counters["tx_queued"], counters["tx_retries"], rig.lost) == (frames, 0, 0)
+    finally:
+        rig.close()
+
+
 def test_the_loop_wakes_for_several_frames_at_once() -> None:
     with silent(bitrate=500_000, room=27, depth=20) as rig:
         for number in range(100):

@@ -59,6 +59,7 @@ class Silent(Rig):
         self.sent: list[bytes] = []
         self.lost = 0
         self.busy_ns = 0.0  # when the bus is free again
+        self.stalls: list[tuple[int, int]] = []  # from, to: nothing reaches the device
         self.others: deque[tuple[int, bytes]] = deque()  # when they would like to send
         set_sending(self.relay, Sending(Confirms.NOTHING, paced_bitrate=bitrate, depth=depth))
 
@@ -90,6 +91,7 @@ class Silent(Rig):
 
     def _link(self, line: bytes) -> None:
         arrives = self.now + self.random.randint(0, self.link_ns)
+        arrives = max([arrives, *(end for begin, end in self.stalls if begin <= arrives < end)])
         if self.under_way:
             arrives = max(arrives, self.under_way[-1][0])
         self.under_way.append((arrives, line))
