@@ -65,9 +65,12 @@ def explain_refused_usb(node: Path, vendor: int, product: int) -> str:
 
 
 def explain_missing_group(status: os.stat_result) -> str:
-    """What is to be done if the node's group may use it, and this process is not in that; else ""."""
+    """What is to be done if the node's group may use it, and this process is not in that; else "".
+
+    Nobody is told to join the group root, which the kernel gives to the nodes of USB devices.
+    """
     gid = status.st_gid
-    if status.st_mode & 0o060 != 0o060 or gid in {os.getegid(), *os.getgroups()}:
+    if gid == 0 or status.st_mode & 0o060 != 0o060 or gid in {os.getegid(), *os.getgroups()}:
         return ""
     user, group = user_name(), _group_name(gid)
     if not in_container():

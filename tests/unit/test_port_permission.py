@@ -37,11 +37,14 @@ def status(gid: int, mode: int = 0o660) -> os.stat_result:
     return os.stat_result((stat.S_IFCHR | mode, 0, 0, 1, 0, gid, 0, 0, 0, 0))
 
 
-def test_a_group_that_may_use_it() -> None:
+def test_a_group_that_may_use_it(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"has no permission: add it to group {OTHER_GROUP} (`usermod -aG {OTHER_GROUP} "
     assert text in explain_missing_group(status(OTHER_GROUP))
     assert explain_missing_group(status(os.getegid())) == ""
     assert explain_missing_group(status(OTHER_GROUP, 0o640)) == ""
+    monkeypatch.setattr(os, "getegid", lambda: OTHER_GROUP)
+    monkeypatch.setattr(os, "getgroups", list)
+    assert explain_missing_group(status(0)) == ""
 
 
 @pytest.mark.usefixtures("container")
