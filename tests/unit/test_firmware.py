@@ -35,6 +35,7 @@ def test_a_profile_says_what_can_be(profile: Profile) -> None:
     assert profile.close_answers
     assert profile.answers or sending.confirms in {Confirms.NOTHING, Confirms.ALWAYS}
     assert sending.window is None or 1 <= sending.window <= 32
+    assert not (sending.confirms is Confirms.SENT and sending.retries), "what it refuses may have been sent"
     assert sending.depth <= profile.buffer, "more frames than it has room for"
     assert sending.paced_bitrate is None, "that is the channel's"
     assert (sending.confirms is Confirms.NOTHING) <= profile.paced, "nothing else holds it back"
